@@ -1,0 +1,1 @@
+"""Analytic compensators as policies."""

@@ -1,0 +1,15 @@
+"""Gymnasium environments of robots with elastic joints: a single-actuator testbed.
+
+    import gymnasium, elastic_env
+    env = gymnasium.make("elastic_env/Testbed-v0", scenario="nominal")
+"""
+
+import gymnasium
+
+__version__ = "0.1.0"
+
+gymnasium.register(
+    id="elastic_env/Testbed-v0",
+    entry_point="elastic_env.envs:make_testbed",
+    vector_entry_point="elastic_env.envs:make_testbed_vector",
+)

@@ -1,0 +1,291 @@
+"""Gymnasium faces of the worlds: one world as an `Env`, many as a `VectorEnv`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from elastic_env.elasticity import ElasticJoint
+from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.references import Hold, Multisine, Sine, Steps, make_reference
+from elastic_env.rendering import Picture, TestbedPicture
+from elastic_env.robots.elastic_joint import Form
+from elastic_env.robots.robot_model import RobotModel, read_stiffness
+from elastic_env.robots.testbed import Pendulum
+from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.signals import Array, BoolArray
+from elastic_env.tasks.task import Task
+from elastic_env.tasks.testbed import TestbedConfig, TestbedTask
+from elastic_env.worlds import Transition, Worlds
+
+Observation = npt.NDArray[np.float64]
+Action = npt.NDArray[np.float32]
+
+RENDER_MODES = ("rgb_array", "human")
+
+
+class ElasticEnv(gymnasium.Env[Observation, Action]):
+    """One world of a task.
+
+    Args:
+        task: The rules, for one world.
+        render_mode: "rgb_array", "human" or None.
+        picture: Makes the picture of the task when it is first rendered.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012  Gymnasium's own form
+
+    def __init__(
+        self, task: Task, render_mode: str | None, picture: Callable[[], Picture]
+    ) -> None:
+        if render_mode not in (None, *RENDER_MODES):
+            raise unknown_name("render mode", render_mode, RENDER_MODES)
+        self.render_mode = render_mode
+        self.observation_space = task.observation_table.space(np.float64)
+        self.action_space = task.action_table.space(np.float32)
+        self._worlds = Worlds(task, num_threads=1)
+        self._make_picture, self._picture = picture, None
+
+    @property
+    def assumed_model(self) -> RobotModel:
+        """What a compensator may know of the robot."""
+        return self._worlds.task.assumed_model
+
+    @property
+    def task(self) -> Task:
+        """The rules of this environment."""
+        return self._worlds.task
+
+    def truth(self) -> Any:
+        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
+        return self._worlds.task.truth()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; `options` are not used."""
+        super().reset(seed=seed, options=options)
+        self._worlds.restart(np.ones(1, dtype=np.bool_), [self.np_random])
+        self._render_human()
+        return self._worlds.task.observe()[0], _first(self._worlds.task.signals())
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control period under a command offset [rad]."""
+        result = self._worlds.step(np.asarray(action)[None])
+        self._render_human()
+        return (
+            result.observation[0],
+            float(result.reward[0]),
+            bool(result.terminated[0]),
+            bool(result.truncated[0]),
+            _first(result.info),
+        )
+
+    def render(self) -> Any:
+        """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
+        return self._draw().rgb(self._worlds.task.signals()) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window and free the renderer."""
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def _draw(self) -> Picture:
+        if self._picture is None:
+            self._picture = self._make_picture()
+        return self._picture
+
+    def _render_human(self) -> None:
+        if self.render_mode == "human":
+            self._draw().show(self._worlds.task.signals())
+
+
+class ElasticVectorEnv(gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]):
+    """Many worlds of a task on a thread pool.
+
+    World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever the number of worlds
+    and threads.
+
+    Args:
+        task: The rules, for num_envs worlds.
+        num_threads: Threads of the physics, 0 for all cores.
+        autoreset_mode: Gymnasium's `AutoresetMode` or its value.
+    """
+
+    def __init__(self, task: Task, num_threads: int = 0, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP):
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            raise unknown_name("autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode]) from None
+        self.metadata = {"autoreset_mode": self.autoreset_mode}
+        self.num_envs = task.num_worlds
+        self.single_observation_space = task.observation_table.space(np.float64)
+        self.single_action_space = task.action_table.space(np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._worlds = Worlds(task, num_threads)
+        self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
+        self._done = np.zeros(self.num_envs, dtype=np.bool_)
+
+    @property
+    def assumed_model(self) -> RobotModel:
+        """What a compensator may know of the robot."""
+        return self._worlds.task.assumed_model
+
+    @property
+    def task(self) -> Task:
+        """The rules of this environment."""
+        return self._worlds.task
+
+    def truth(self) -> Any:
+        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
+        return self._worlds.task.truth()
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode in every world, or in those of options["reset_mask"]."""
+        mask = np.ones(self.num_envs, dtype=np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"], dtype=np.bool_)
+        seeds = _seeds(seed, self.num_envs)
+        for world in np.flatnonzero(mask):
+            if seeds[world] is not None:
+                self._generators[world] = seeding.np_random(seeds[world])[0]
+        self._begin(mask)
+        return self._worlds.task.observe(), self._worlds.task.signals()
+
+    def step(
+        self, actions: Action
+    ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
+        """One control period in every world under command offsets, (num_envs, n) [rad]."""
+        restarting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
+        result = self._worlds.step(np.where(restarting[:, None], 0.0, np.asarray(actions)))
+        if restarting.any():
+            result = self._restarted_instead(result, restarting)
+        self._done = result.done
+        observation, info = result.observation, _with_mask(result.info, result.done)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and result.done.any():
+            observation, info = self._restarted_after(result)
+        return observation, result.reward, result.terminated, result.truncated, info
+
+    def _begin(self, worlds: BoolArray) -> None:
+        self._worlds.restart(worlds, self._generators)
+        self._done = self._done & ~worlds
+
+    def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
+        """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
+        self._begin(worlds)
+        fresh = self._worlds.task.signals()
+        info = {key: np.where(worlds, fresh[key], value) if key in fresh else value for key, value in result.info.items()}
+        info["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
+        info["termination"] = np.where(worlds, "", info["termination"])
+        return Transition(
+            self._worlds.task.observe(),
+            np.where(worlds, 0.0, result.reward),
+            result.terminated & ~worlds,
+            result.truncated & ~worlds,
+            info,
+        )
+
+    def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
+        """SAME_STEP: the worlds that end begin anew at once; their last observation and info are kept beside."""
+        final_observation = np.full(self.num_envs, None, dtype=object)
+        for world in np.flatnonzero(result.done):
+            final_observation[world] = result.observation[world].copy()
+        final_info = _with_mask(result.info, result.done)
+        self._begin(result.done)
+        fresh = self._worlds.task.signals()
+        info = {key: np.where(result.done, fresh[key], value) for key, value in result.info.items() if key in fresh}
+        info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
+        info |= {"final_info": final_info, "_final_info": result.done.copy()}
+        return self._worlds.task.observe(), info
+
+
+def testbed_config(
+    reference: str | dict[str, Any] | Hold | Sine | Multisine | Steps = "hold",
+    scenario: str | Scenario = "nominal",
+    stiffness: float | str | Path | None = None,
+    joint: ElasticJoint | None = None,
+    pendulum: Pendulum | None = None,
+    form: Form = "tendon",
+    observe_link: bool = False,
+) -> TestbedConfig:
+    """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
+
+    Args:
+        reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a reference model.
+        scenario: Name as in `elastic_env.scenario`, or a `Scenario`.
+        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that of the joint.
+        joint: Elastic joint; default the paper's H54-200-S500-R.
+        pendulum: The load; default 60 N·m at the horizontal.
+        form: "tendon", "series" or "rigid".
+        observe_link: Whether the link's IMU is part of the observation.
+
+    Raises:
+        ConfigurationError: A name, a parameter or a combination that does not exist.
+    """
+    chosen = joint if joint is not None else TestbedConfig.model_fields["joint"].default
+    if stiffness is not None:
+        chosen = chosen.replace(stiffness=read_stiffness(stiffness))
+    if form == "series":
+        raise ConfigurationError("the testbed environment has the forms 'tendon' and 'rigid'; 'series' is for checks")
+    return TestbedConfig(
+        reference=make_reference(reference),
+        scenario=make_scenario(scenario),
+        joint=chosen,
+        pendulum=pendulum if pendulum is not None else Pendulum(),
+        form=form,
+        observe_link=observe_link,
+    )
+
+
+def make_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
+    """Entry point of `elastic_env/Testbed-v0`; arguments as in `testbed_config`."""
+    config = testbed_config(**arguments)
+    return ElasticEnv(TestbedTask(config, num_worlds=1), render_mode, lambda: TestbedPicture(config.pendulum))
+
+
+def make_testbed_vector(
+    num_envs: int = 1,
+    num_threads: int = 0,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    render_mode: str | None = None,
+    **arguments: Any,
+) -> ElasticVectorEnv:
+    """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `testbed_config`."""
+    if render_mode is not None:
+        raise ConfigurationError(f"the vector environment does not render, got render_mode {render_mode!r}; use None")
+    if num_envs < 1:
+        raise ConfigurationError(f"num_envs must be at least 1, got {num_envs}")
+    return ElasticVectorEnv(TestbedTask(testbed_config(**arguments), num_envs), num_threads, autoreset_mode)
+
+
+def _seeds(seed: int | list[int | None] | None, num_envs: int) -> list[int | None]:
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + i for i in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
+    return list(seed)
+
+
+def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
+    """Episode metrics with Gymnasium's mark of the worlds that have them, left out where no episode ends."""
+    others = {key: value for key, value in info.items() if key != "episode_metrics"}
+    if not done.any():
+        return others
+    return {**others, "episode_metrics": info["episode_metrics"], "_episode_metrics": done.copy()}
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    """The info of the only world, with Python scalars."""
+    return {key: _first(value) if isinstance(value, dict) else value[0].item() for key, value in info.items()}

@@ -1,0 +1,295 @@
+"""Reference trajectories of the testbed: static positions, sine, multisine, steps.
+
+A reference is a validated model; `plan` turns it into samples at the control rate, with rate and acceleration in closed
+form. Every plan begins with a second of standing, in which policies ramp in, and moves by quintic (minimum-jerk)
+polynomials, which start and end without acceleration.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from elastic_env.config import Model, quantity
+from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.signals import Array, BoolArray, IntArray
+
+STAND_S = 1.0
+"""Time at the first position in which policies ramp in; not scored."""
+
+_QUINTIC_PEAK_RATE = 15.0 / 8.0
+_QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Samples of a reference at the control rate; row k is the target at the end of control period k, row 0 the start.
+
+    `scored` marks the rows that count in metrics; `rest` numbers the windows at rest of `Hold`, -1 elsewhere.
+    """
+
+    q: Array
+    q_dot: Array
+    q_ddot: Array
+    scored: BoolArray
+    rest: IntArray
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps of an episode."""
+        return len(self.q) - 1
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Bounds of a reference over all its plans: largest |q| [rad], |q̇| [rad/s], |q̈| [rad/s²]."""
+
+    q: float
+    q_dot: float
+    q_ddot: float
+
+
+def quintic(s: Array) -> tuple[Array, Array, Array]:
+    """Minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1 and its first two derivatives by s, s clipped to [0, 1]."""
+    s = np.clip(s, 0.0, 1.0)
+    return (
+        s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+        30.0 * s**2 * (1.0 - s) ** 2,
+        60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
+    )
+
+
+def _moves(t: Array, start: float, moves: list[tuple[float, float, float]]) -> tuple[Array, Array, Array]:
+    """Quintic moves (begin [s], duration [s], target [rad]) one after the other, at the times t."""
+    q, q_dot, q_ddot = np.full_like(t, start), np.zeros_like(t), np.zeros_like(t)
+    position = start
+    for begin, duration, target in moves:
+        blend, blend_dot, blend_ddot = quintic((t - begin) / duration)
+        q += (target - position) * blend
+        q_dot += (target - position) * blend_dot / duration
+        q_ddot += (target - position) * blend_ddot / duration**2
+        position = target
+    return q, q_dot, q_ddot
+
+
+def _times(duration_s: float, control_period_s: float) -> Array:
+    return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
+
+
+class Hold(Model):
+    """The paper's static positions, evenly spaced in gravity torque, approached from below and then from above.
+
+    The sweep starts below the first position and turns round beyond the last, so that every position is reached from
+    both sides. Moves are slow: a link that overshoots would lose the friction's hysteresis, which the experiment shows.
+    """
+
+    kind: Literal["hold"] = "hold"
+    positions: int = quantity("1", 24, ge=2, description="number of static positions")
+    lower: float = quantity("1", -0.875, gt=-1, lt=1, description="first position, as a share of the torque at horizontal")
+    upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
+    rate: float = quantity("rad/s", 0.1, gt=0, description="peak rate of the moves")
+    settle_s: float = quantity("s", 1.0, ge=0, description="time at rest before the measurement")
+    measure_s: float = quantity("s", 0.5, gt=0, description="time of the measurement")
+    overrun: float = quantity("rad", 0.08, gt=0, description="how far the sweep starts and turns outside the positions")
+
+    @model_validator(mode="after")
+    def _range_is_ordered(self) -> Self:
+        if self.upper <= self.lower:
+            raise ValueError(f"upper must exceed lower, got lower {self.lower} and upper {self.upper}")
+        return self
+
+    @property
+    def angles(self) -> Array:
+        """Static positions, (positions,) [rad], for τ_g proportional to sin q."""
+        return np.arcsin(np.linspace(self.lower, self.upper, self.positions))
+
+    @property
+    def visits(self) -> tuple[Array, IntArray]:
+        """Angle [rad] and direction of approach (+1 from below, -1 from above) of each window at rest."""
+        angles = self.angles
+        directions = np.repeat(np.array([1, -1]), len(angles))
+        return np.concatenate([angles, angles[::-1]]), directions
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        q = float(np.abs(self.angles).max()) + self.overrun
+        shortest = _QUINTIC_PEAK_RATE * float(np.diff(self.angles).min()) / self.rate
+        return Extent(q, self.rate, _QUINTIC_PEAK_ACCELERATION / _QUINTIC_PEAK_RATE * self.rate / shortest)
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
+        """The plan, the same for every generator."""
+        angles, directions = self.visits
+        start, turn = angles[0] - self.overrun, self.angles[-1] + self.overrun
+        moves, windows = [], []
+        now, position = STAND_S, start
+
+        def move(target: float) -> None:
+            nonlocal now, position
+            duration = _QUINTIC_PEAK_RATE * abs(target - position) / self.rate
+            moves.append((now, duration, target))
+            now, position = now + duration, target
+
+        for visit, (angle, direction) in enumerate(zip(angles, directions, strict=True)):
+            if visit > 0 and direction != directions[visit - 1]:
+                move(turn)
+            move(angle)
+            windows.append((now + self.settle_s, now + self.settle_s + self.measure_s))
+            now = windows[-1][1]
+        t = _times(now, control_period_s)
+        q, q_dot, q_ddot = _moves(t, start, moves)
+        rest = np.full(len(t), -1)
+        for visit, (begin, end) in enumerate(windows):
+            rest[(t > begin) & (t <= end + 1e-9)] = visit
+        return Plan(q, q_dot, q_ddot, rest >= 0, rest)
+
+
+class _Oscillation(Model):
+    """What sine and multisine share: amplitude, an envelope that starts smoothly, a duration."""
+
+    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
+    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="angle about which it oscillates")
+    duration_s: float = quantity("s", 12.0, gt=0, description="scored time")
+    onset_s: float = quantity("s", 2.0, gt=0, description="time in which the amplitude grows; not scored")
+
+    def _enveloped(self, t: Array, x: Array, x_dot: Array, x_ddot: Array) -> Plan:
+        w, w_dot, w_ddot = quintic((t - STAND_S) / self.onset_s)
+        w_dot, w_ddot = w_dot / self.onset_s, w_ddot / self.onset_s**2
+        return Plan(
+            q=self.middle + w * x,
+            q_dot=w_dot * x + w * x_dot,
+            q_ddot=w_ddot * x + 2.0 * w_dot * x_dot + w * x_ddot,
+            scored=t > STAND_S + self.onset_s,
+            rest=np.full(len(t), -1),
+        )
+
+    def _extent(self, rate: float, acceleration: float) -> Extent:
+        """Bounds with the envelope, whatever the phase of the oscillation when it grows."""
+        w, w_dot, w_ddot = quintic(np.linspace(0.0, 1.0, 1001))
+        w_dot, w_ddot = w_dot / self.onset_s, np.abs(w_ddot) / self.onset_s**2
+        return Extent(
+            q=abs(self.middle) + self.amplitude,
+            q_dot=float((w_dot * self.amplitude + w * rate).max()),
+            q_ddot=float((w_ddot * self.amplitude + 2.0 * w_dot * rate + w * acceleration).max()),
+        )
+
+    def _time_base(self, control_period_s: float) -> Array:
+        return _times(STAND_S + self.onset_s + self.duration_s, control_period_s)
+
+
+class Sine(_Oscillation):
+    """One sine, the same in every episode."""
+
+    kind: Literal["sine"] = "sine"
+    frequency_hz: float = quantity("Hz", 0.25, gt=0, description="frequency")
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        omega = 2.0 * np.pi * self.frequency_hz
+        return self._extent(self.amplitude * omega, self.amplitude * omega**2)
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
+        """The plan, the same for every generator."""
+        t = self._time_base(control_period_s)
+        omega = 2.0 * np.pi * self.frequency_hz
+        phase = omega * (t - STAND_S)
+        x = self.amplitude * np.sin(phase)
+        return self._enveloped(t, x, self.amplitude * omega * np.cos(phase), -(omega**2) * x)
+
+
+class Multisine(_Oscillation):
+    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode; their sum stays inside."""
+
+    kind: Literal["multisine"] = "multisine"
+    lowest_hz: float = quantity("Hz", 0.1, gt=0, description="lowest frequency")
+    highest_hz: float = quantity("Hz", 1.0, gt=0, description="highest frequency")
+    components: int = quantity("1", 5, ge=2, description="number of sines")
+    seed: int | None = quantity("1", None, ge=0, description="seed of the phases; None draws new ones per episode")
+
+    @model_validator(mode="after")
+    def _frequencies_are_ordered(self) -> Self:
+        if self.highest_hz <= self.lowest_hz:
+            raise ValueError(f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz")
+        return self
+
+    @property
+    def _omega(self) -> Array:
+        return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        share = self.amplitude / self.components
+        return self._extent(share * float(self._omega.sum()), share * float((self._omega**2).sum()))
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan with phases of the generator, or of the reference's own seed."""
+        phases = _own(generator, self.seed).uniform(0.0, 2.0 * np.pi, self.components)
+        t = self._time_base(control_period_s)
+        omega, share = self._omega, self.amplitude / self.components
+        angle = omega * (t[:, None] - STAND_S) + phases
+        x = share * np.sin(angle).sum(axis=1)
+        x_dot = share * (omega * np.cos(angle)).sum(axis=1)
+        x_ddot = -share * (omega**2 * np.sin(angle)).sum(axis=1)
+        return self._enveloped(t, x, x_dot, x_ddot)
+
+
+class Steps(Model):
+    """Quick moves between random levels, each followed by a rest."""
+
+    kind: Literal["steps"] = "steps"
+    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
+    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="middle of the levels")
+    move_s: float = quantity("s", 0.8, gt=0, description="duration of a move")
+    rest_s: float = quantity("s", 1.2, ge=0, description="rest after a move")
+    moves: int = quantity("1", 5, ge=1, description="number of moves")
+    seed: int | None = quantity("1", None, ge=0, description="seed of the levels; None draws new ones per episode")
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        span = 2.0 * self.amplitude
+        return Extent(
+            q=abs(self.middle) + self.amplitude,
+            q_dot=_QUINTIC_PEAK_RATE * span / self.move_s,
+            q_ddot=_QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
+        )
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan with levels of the generator, or of the reference's own seed."""
+        offsets = _own(generator, self.seed).uniform(-self.amplitude, self.amplitude, self.moves)
+        period = self.move_s + self.rest_s
+        moves = [(STAND_S + i * period, self.move_s, float(self.middle + x)) for i, x in enumerate(offsets)]
+        t = _times(STAND_S + self.moves * period, control_period_s)
+        q, q_dot, q_ddot = _moves(t, self.middle, moves)
+        return Plan(q, q_dot, q_ddot, scored=t > STAND_S, rest=np.full(len(t), -1))
+
+
+Reference = Annotated[Hold | Sine | Multisine | Steps, Field(discriminator="kind")]
+
+REFERENCES: dict[str, type[Hold] | type[Sine] | type[Multisine] | type[Steps]] = {
+    "hold": Hold,
+    "sine": Sine,
+    "multisine": Multisine,
+    "steps": Steps,
+}
+
+
+def make_reference(reference: "str | dict[str, Any] | Hold | Sine | Multisine | Steps") -> Hold | Sine | Multisine | Steps:
+    """A reference from its name, from a mapping with `kind` and parameters, or as it is.
+
+    Raises:
+        ConfigurationError: The kind does not exist, or a parameter does not fit it.
+    """
+    if isinstance(reference, Hold | Sine | Multisine | Steps):
+        return reference
+    if isinstance(reference, str):
+        reference = {"kind": reference}
+    if not isinstance(reference, dict):
+        raise ConfigurationError(f"a reference is a name, a mapping or a model, got {type(reference).__name__}")
+    kind = reference.get("kind")
+    if kind not in REFERENCES:
+        raise unknown_name("reference", kind, REFERENCES)
+    return REFERENCES[str(kind)](**reference)
+
+
+def _own(generator: np.random.Generator, seed: int | None) -> np.random.Generator:
+    return generator if seed is None else np.random.default_rng(seed)

@@ -1,0 +1,1 @@
+"""Robots as MuJoCo specifications, and the transform that makes their hinges elastic."""

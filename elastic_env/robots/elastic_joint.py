@@ -1,0 +1,342 @@
+"""Turn rigid hinges of any MuJoCo specification into elastic joints.
+
+Three forms of the same joint:
+
+* `tendon` (default): the rotor is a hinge `<joint>_motor` of its own with armature B, and a fixed tendon
+  `<joint>_spring` of length θ − q couples it to the link's hinge: K, D, and backlash as the spring's dead band.
+  The link's hinge keeps its name, axis, limits and everything that refers to it.
+* `series`: two collinear hinges on the link's body, θ = `<joint>_motor` and q − θ = `<joint>`; the link angle is
+  the length of the tendon `<joint>_link`. Slower; kept for checking the tendon form.
+* `rigid`: no spring; the rotor's inertia is the hinge's armature.
+
+Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import mujoco
+import numpy as np
+
+from elastic_env.elasticity import ElasticJoint, Servo
+from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.signals import Array, IntArray
+
+Form = Literal["tendon", "series", "rigid"]
+ActuatorRule = Literal["keep", "replace"]
+
+_JOINT = mujoco.mjtTrn.mjTRN_JOINT
+_ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_ROTOR_MASS = 1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+# MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
+_FRICTION_SOLREF = (0.001, 1.0)
+_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+
+
+def motor_name(joint: str) -> str:
+    """Name of the rotor's hinge of an elastic joint."""
+    return f"{joint}_motor"
+
+
+def spring_name(joint: str) -> str:
+    """Name of the tendon of length θ − q."""
+    return f"{joint}_spring"
+
+
+def servo_name(joint: str) -> str:
+    """Name of the servo's actuator."""
+    return f"{joint}_servo"
+
+
+def link_name(joint: str) -> str:
+    """Name of the tendon whose length is q in the series form."""
+    return f"{joint}_link"
+
+
+@dataclass(frozen=True)
+class JointAddresses:
+    """Where motor and link angles of the elastic joints stand in `qpos` and `qvel`, each (n,)."""
+
+    theta: IntArray
+    q: IntArray
+    theta_dot: IntArray
+    q_dot: IntArray
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joints: Sequence[str]) -> "JointAddresses":
+        """Look the joints up by name, in a model of the tendon or the rigid form."""
+        link = [model.joint(name) for name in joints]
+        known = {model.joint(i).name for i in range(model.njnt)}
+        motor = [model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints]
+        return cls(
+            theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),
+            q=np.array([joint.qposadr[0] for joint in link], dtype=np.int64),
+            theta_dot=np.array([joint.dofadr[0] for joint in motor], dtype=np.int64),
+            q_dot=np.array([joint.dofadr[0] for joint in link], dtype=np.int64),
+        )
+
+
+def make_elastic(
+    spec: mujoco.MjSpec,
+    joints: Mapping[str, ElasticJoint],
+    form: Form = "tendon",
+    actuators: ActuatorRule = "keep",
+) -> mujoco.MjSpec:
+    """A copy of a specification in which the named hinges are elastic.
+
+    What a hinge had stays: limits, springs, damping and friction on the link (the joint's friction is added to it),
+    sensors and equalities on the link angle, actuators on the rotor. Its armature, which stands for the rotor, is
+    replaced by the rotor inertia. Keyframes get the rotors at their link angles, without deflection.
+
+    Args:
+        spec: Any specification with hinges; it is not changed.
+        joints: Parameters by hinge name.
+        form: "tendon", "series" or "rigid", see the module.
+        actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where there is none;
+            "replace" deletes them and adds the servo.
+
+    Returns:
+        The elastic specification, ready to compile.
+
+    Raises:
+        ConfigurationError: Unknown form or hinge, a joint that is no hinge, a name that is already taken, or
+            parameters that the series form cannot represent.
+    """
+    if form not in get_args(Form):
+        raise unknown_name("form", form, get_args(Form))
+    if actuators not in get_args(ActuatorRule):
+        raise unknown_name("actuator rule", actuators, get_args(ActuatorRule))
+    elastic = spec.copy()
+    keyframes = _take_keyframes(elastic)
+    for name, joint in joints.items():
+        _transform(elastic, _hinge(elastic, name), joint, form, actuators)
+    _give_keyframes(elastic, keyframes, list(joints))
+    return elastic
+
+
+def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
+    hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
+    if name not in hinges:
+        raise unknown_name("hinge", name, hinges)
+    taken = {j.name for j in spec.joints} | {t.name for t in spec.tendons} | {a.name for a in spec.actuators}
+    for derived in (motor_name(name), spring_name(name), servo_name(name), link_name(name)):
+        if derived in taken:
+            raise ConfigurationError(f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?")
+    return spec.joint(name)
+
+
+def _transform(
+    spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint, form: Form, rule: ActuatorRule
+) -> None:
+    name = hinge.name
+    driven = name if form == "rigid" else motor_name(name)
+    if form == "tendon":
+        _add_rotor(hinge, joint, _rotor_body(spec, hinge))
+        _add_spring(spec, name, joint)
+        _add_friction(hinge, joint)
+        hinge.armature = 0.0
+    elif form == "series":
+        _split_hinge(spec, hinge, joint)
+    else:
+        _add_friction(hinge, joint)
+        hinge.armature = joint.rotor_inertia
+    _drive(spec, name, driven, joint.servo, rule)
+
+
+def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
+    """A body for the rotor beside the link's. Where it is does not matter: it has no mass, only the armature."""
+    body = hinge.parent
+    parent = body.parent if isinstance(body.parent, mujoco.MjsBody) else spec.worldbody
+    return parent.add_body(
+        name=motor_name(hinge.name), mass=_ROTOR_MASS, inertia=[_ROTOR_MASS] * 3, explicitinertial=True
+    )
+
+
+def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody) -> mujoco.MjsJoint:
+    """The rotor's hinge. Every attribute is set: the model's default class must not leak into the rotor."""
+    limits = _in_radians(hinge, hinge.range)
+    rotor = body.add_joint(
+        name=motor_name(hinge.name),
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        pos=hinge.pos,
+        axis=hinge.axis,
+        ref=hinge.ref,
+        springref=hinge.ref,
+        armature=joint.rotor_inertia,
+        limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+        range=limits,  # not enforced, so not converted either; for actuators that inherit their range
+        actfrclimited=hinge.actfrclimited,
+        actfrcrange=hinge.actfrcrange,
+        frictionloss=0.0,
+        group=hinge.group,
+    )
+    rotor.stiffness = rotor.damping = np.zeros(3)
+    rotor.springdamper = np.zeros(2)
+    hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    hinge.actfrcrange = np.zeros(2)
+    return rotor
+
+
+def _in_radians(hinge: mujoco.MjsJoint, angle: Array) -> Array:
+    """An angle of the specification, which may be written in degrees, as the compiled model has it."""
+    return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
+
+
+def _blank_tendon(spec: mujoco.MjSpec, name: str) -> mujoco.MjsTendon:
+    """A tendon without any spring, damper, friction or limit that a default class may hold."""
+    tendon = spec.add_tendon(name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE, frictionloss=0.0, armature=0.0)
+    tendon.stiffness = tendon.damping = np.zeros(3)
+    tendon.springlength = np.zeros(2)
+    tendon.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    return tendon
+
+
+def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
+    spring = _blank_tendon(spec, spring_name(name))
+    spring.wrap_joint(motor_name(name), 1.0)
+    spring.wrap_joint(name, -1.0)
+    spring.stiffness = np.array([joint.stiffness, 0.0, 0.0])
+    spring.damping = np.array([joint.damping, 0.0, 0.0])
+    spring.springlength = np.array([-joint.backlash / 2, joint.backlash / 2])
+
+
+def _add_friction(element: mujoco.MjsJoint | mujoco.MjsTendon, joint: ElasticJoint) -> None:
+    """Friction on the link angle, on top of what the element has."""
+    element.damping = element.damping + np.array([joint.viscous_friction, 0.0, 0.0])
+    if joint.coulomb_friction > 0.0:
+        element.frictionloss += joint.coulomb_friction
+        element.solref_friction[:] = _FRICTION_SOLREF
+        element.solimp_friction[:] = _FRICTION_SOLIMP
+
+
+def _split_hinge(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+    """Series form: a collinear hinge for θ; the old hinge becomes q − θ and carries the spring."""
+    body = hinge.parent
+    if body.joints[-1].name != hinge.name:
+        raise ConfigurationError(
+            f"the series form needs {hinge.name!r} to be the last joint of its body {body.name!r}, which ends with "
+            f"{body.joints[-1].name!r}; use the tendon form"
+        )
+    if joint.backlash > 0.0:
+        raise ConfigurationError(
+            f"the series form has a linear spring, but backlash of {hinge.name!r} is {joint.backlash} rad; "
+            "use the tendon form"
+        )
+    _add_rotor(hinge, joint, body)
+    link = _blank_tendon(spec, link_name(hinge.name))
+    link.wrap_joint(motor_name(hinge.name), 1.0)
+    link.wrap_joint(hinge.name, 1.0)
+    link.limited, link.range = hinge.limited, _in_radians(hinge, hinge.range)
+    link.stiffness, link.damping = np.array(hinge.stiffness), np.array(hinge.damping)
+    link.springlength = _in_radians(hinge, np.full(2, hinge.springref))
+    link.frictionloss = hinge.frictionloss
+    _add_friction(link, joint)
+    hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_FALSE, np.zeros(2)
+    hinge.frictionloss, hinge.armature, hinge.ref, hinge.springref = 0.0, 0.0, 0.0, 0.0
+    hinge.stiffness = np.array([joint.stiffness, 0.0, 0.0])
+    hinge.damping = np.array([joint.damping, 0.0, 0.0])
+
+
+def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule) -> None:
+    """Put the hinge's actuators, or the servo, on the driven joint."""
+    existing = [a for a in spec.actuators if a.trntype in _ON_JOINT and a.target == name]
+    for actuator in existing:
+        if rule == "replace":
+            spec.delete(actuator)
+        else:
+            actuator.target = driven
+    if servo is not None and (rule == "replace" or not existing):
+        _add_servo(spec, servo_name(name), driven, servo)
+
+
+def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> None:
+    actuator = spec.add_actuator(name=name, target=target, trntype=_JOINT)
+    actuator.set_to_pid(
+        kp=servo.position_gain,
+        kv=servo.velocity_gain,
+        ki=servo.integral_gain,
+        imax=servo.torque_limit / servo.integral_gain if servo.integral_gain > 0.0 else 0.0,
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
+    )
+    actuator.gear = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])
+
+
+@dataclass(frozen=True)
+class _Keyframes:
+    """The keyframes of the rigid model, and its joints and actuators in the order of their vectors."""
+
+    model: mujoco.MjModel
+    joints: list[mujoco.MjsJoint]
+    actuators: list[mujoco.MjsActuator]
+
+
+def _take_keyframes(spec: mujoco.MjSpec) -> _Keyframes | None:
+    """Remove the keyframes, whose vectors no longer fit once joints are added."""
+    if not spec.keys:
+        return None
+    model = spec.compile()
+    keyframes = _Keyframes(
+        model, sorted(spec.joints, key=lambda j: j.id), sorted(spec.actuators, key=lambda a: a.id)
+    )
+    for key in list(spec.keys):
+        spec.delete(key)
+    return keyframes
+
+
+def _give_keyframes(spec: mujoco.MjSpec, keyframes: _Keyframes | None, joints: list[str]) -> None:
+    """Add the keyframes again, with rotors at their link angles and servos holding them."""
+    if keyframes is None:
+        return
+    rigid, model = keyframes.model, spec.compile()
+    series = [name for name in joints if any(t.name == link_name(name) for t in spec.tendons)]
+    for k in range(rigid.nkey):
+        qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
+        for old, joint in enumerate(keyframes.joints):
+            new = joint.id
+            qpos[_range(model.jnt_qposadr, new, model.nq)] = rigid.key_qpos[k, _range(rigid.jnt_qposadr, old, rigid.nq)]
+            qvel[_range(model.jnt_dofadr, new, model.nv)] = rigid.key_qvel[k, _range(rigid.jnt_dofadr, old, rigid.nv)]
+        act, ctrl = np.zeros(model.na), np.zeros(model.nu)
+        for old, actuator in enumerate(keyframes.actuators):
+            if actuator.id < 0 or actuator.name not in {a.name for a in spec.actuators}:
+                continue  # replaced by a servo
+            new = actuator.id
+            ctrl[_ctrl_range(model, new)] = rigid.key_ctrl[k, _ctrl_range(rigid, old)]
+            act[_act_range(model, new)] = rigid.key_act[k, _act_range(rigid, old)]
+        for name in joints:
+            _start_undeflected(model, name, qpos, qvel, ctrl, name in series)
+        spec.add_key(
+            name=rigid.key(k).name, time=rigid.key_time[k], qpos=qpos, qvel=qvel, act=act, ctrl=ctrl,
+            mpos=rigid.key_mpos[k].ravel(), mquat=rigid.key_mquat[k].ravel(),
+        )  # fmt: skip
+
+
+def _start_undeflected(
+    model: mujoco.MjModel, name: str, qpos: Array, qvel: Array, ctrl: Array, series: bool
+) -> None:
+    """θ = q, θ̇ = q̇ and the servo's command at the link angle, in one keyframe's vectors."""
+    at = JointAddresses.of(model, [name])
+    qpos[at.theta], qvel[at.theta_dot] = qpos[at.q], qvel[at.q_dot]
+    servos = {model.actuator(i).name: i for i in range(model.nactuator)}
+    if servo_name(name) in servos:
+        ctrl[_ctrl_range(model, servos[servo_name(name)])] = qpos[at.theta]
+    if series:
+        qpos[at.q], qvel[at.q_dot] = 0.0, 0.0
+
+
+def _range(starts: IntArray, index: int, total: int) -> slice:
+    """The columns of one element in a vector of all elements, from the elements' first columns."""
+    end = starts[index + 1] if index + 1 < len(starts) else total
+    return slice(int(starts[index]), int(end))
+
+
+def _ctrl_range(model: mujoco.MjModel, index: int) -> slice:
+    return slice(int(model.actuator_ctrladr[index]), int(model.actuator_ctrladr[index] + model.actuator_ctrlnum[index]))
+
+
+def _act_range(model: mujoco.MjModel, index: int) -> slice:
+    first = int(model.actuator_actadr[index])
+    return slice(first, first + int(model.actuator_actnum[index])) if first >= 0 else slice(0, 0)

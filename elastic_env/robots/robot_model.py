@@ -1,0 +1,109 @@
+"""What a compensator may know of a robot: its rigid model and the parameters of its elastic joints."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.elasticity import ElasticJoint, Servo
+from elastic_env.errors import ConfigurationError
+from elastic_env.signals import Array
+
+STIFFNESS_KEY = "stiffness_nm_per_rad"
+"""Where an identification file holds K."""
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A compiled rigid model and an `ElasticJoint` for each of its elastic hinges, in order.
+
+    The same type describes what the compensators assume and, in `truth()`, what the plant really is.
+    """
+
+    joints: Mapping[str, ElasticJoint]
+    rigid: mujoco.MjModel
+    control_period_s: float
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the hinges, in order."""
+        return list(self.joints)
+
+    @property
+    def stiffness(self) -> Array:
+        """K, (n,) [N·m/rad]."""
+        return self._values("stiffness")
+
+    @property
+    def damping(self) -> Array:
+        """D, (n,) [N·m·s/rad]."""
+        return self._values("damping")
+
+    @property
+    def rotor_inertia(self) -> Array:
+        """B, (n,) [kg·m²]."""
+        return self._values("rotor_inertia")
+
+    @property
+    def backlash(self) -> Array:
+        """Width of the dead bands, (n,) [rad]."""
+        return self._values("backlash")
+
+    @property
+    def viscous_friction(self) -> Array:
+        """Viscous friction on the links, (n,) [N·m·s/rad]."""
+        return self._values("viscous_friction")
+
+    @property
+    def servos(self) -> tuple[Servo, ...]:
+        """The servos of the joints.
+
+        Raises:
+            ConfigurationError: A joint has no servo.
+        """
+        without = [name for name, joint in self.joints.items() if joint.servo is None]
+        if without:
+            raise ConfigurationError(f"a servo is needed on every joint, but there is none on: {', '.join(without)}")
+        return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
+
+    def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
+        """The same robot with another stiffness, one number for all joints or one per joint [N·m/rad].
+
+        Raises:
+            ConfigurationError: The number of values does not fit, or one is not positive and finite.
+        """
+        values = np.asarray(stiffness, dtype=np.float64)
+        if values.shape not in {(), (len(self.joints),)}:
+            raise ConfigurationError(
+                f"stiffness must be one number or {len(self.joints)} of them [N·m/rad], one per joint "
+                f"({', '.join(self.joints)}), got an array of shape {values.shape}"
+            )
+        each = np.broadcast_to(values, (len(self.joints),))
+        joints = {n: j.replace(stiffness=float(k)) for (n, j), k in zip(self.joints.items(), each, strict=True)}
+        return replace(self, joints=joints)
+
+    def _values(self, parameter: str) -> Array:
+        return np.array([getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64)
+
+
+def read_stiffness(value: float | str | Path) -> float:
+    """A stiffness given as a number or as the file that `elastic identify` writes [N·m/rad].
+
+    Raises:
+        ConfigurationError: The file does not exist or holds no identified stiffness.
+    """
+    if isinstance(value, int | float):
+        return float(value)
+    path = Path(value)
+    if not path.is_file():
+        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, found no file {path}")
+    try:
+        return float(json.loads(path.read_text())[STIFFNESS_KEY])
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+        raise ConfigurationError(
+            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, as `elastic identify` writes"
+        ) from None

@@ -1,0 +1,73 @@
+"""Named conditions: what the true plant has that the assumed model does not know of.
+
+Two grounds, `ideal` (linear springs, no friction, exact sensors) and `nominal` (the paper's robot: friction, sensor
+noise, encoder counts), and changes on top of either. A change alone is meant on top of `nominal`; `ideal+soft` puts it
+on `ideal`, and changes can be joined: `soft+payload`.
+"""
+
+from elastic_env.config import Model, quantity
+from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.robots.dynamixel import BACKLASH_BOUND_RAD
+from elastic_env.sensors import AttitudeSensor
+
+
+class Scenario(Model):
+    """Difference between the true plant and the assumed model, and the quality of the sensors."""
+
+    name: str = "custom"
+    stiffness_scale: float = quantity("1", 1.0, gt=0, description="true over assumed stiffness of every joint")
+    friction_scale: float = quantity("1", 1.0, ge=0, description="share of the joints' friction that acts, 0 for none")
+    backlash_rad: float = quantity("rad", 0.0, ge=0, description="dead band of every joint, unknown to the compensator")
+    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="true over assumed mass of the testbed's pendulum")
+    encoder_counts: bool = True
+    """Whether the encoders have whole counts."""
+    encoder_bias_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the encoders' homing error")
+    imu: AttitudeSensor = AttitudeSensor()
+    delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
+
+
+_IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
+# an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
+_HOMING_ERROR_RAD = 2e-3
+
+GROUNDS: dict[str, Scenario] = {
+    "ideal": Scenario(name="ideal", friction_scale=0.0, encoder_counts=False),
+    "nominal": Scenario(name="nominal", imu=_IMU),
+}
+
+CHANGES: dict[str, dict[str, object]] = {
+    "soft": {"stiffness_scale": 0.7},
+    "stiff": {"stiffness_scale": 1.3},
+    "payload": {"pendulum_mass_scale": 1.2},
+    "backlash": {"backlash_rad": BACKLASH_BOUND_RAD},
+    "sensor": {
+        "encoder_bias_rad": _HOMING_ERROR_RAD,
+        "imu": _IMU.replace(bias_spread_rad=_HOMING_ERROR_RAD),
+        "delay_steps": 1,
+    },
+}
+
+
+def scenario_names() -> list[str]:
+    """Names that `make_scenario` accepts, joined names aside."""
+    return [*GROUNDS, *CHANGES]
+
+
+def make_scenario(name: "str | Scenario") -> Scenario:
+    """The scenario of a name such as "nominal", "soft", "ideal+soft" or "soft+payload".
+
+    Raises:
+        ConfigurationError: A part of the name does not exist, or a ground stands behind another part.
+    """
+    if isinstance(name, Scenario):
+        return name
+    first, *rest = str(name).split("+")
+    ground, changes = (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
+    scenario = ground
+    for change in changes:
+        if change in GROUNDS:
+            raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
+        if change not in CHANGES:
+            raise unknown_name("scenario", change, scenario_names())
+        scenario = scenario.replace(**CHANGES[change])
+    return scenario.replace(name=str(name))

@@ -1,0 +1,87 @@
+"""What a robot measures: motor encoders with counts, an attitude sensor with noise, bias and a rate of its own."""
+
+import numpy as np
+
+from elastic_env.config import Model, quantity
+from elastic_env.signals import Array, BoolArray, IntArray
+
+
+class AttitudeSensor(Model):
+    """IMU attitude of one axis: bias, white noise, and a sample rate below or at the control rate."""
+
+    noise_rad: float = quantity("rad", 0.0, ge=0, description="standard deviation of the white noise")
+    bias_rad: float = quantity("rad", 0.0, description="constant offset")
+    bias_spread_rad: float = quantity("rad", 0.0, ge=0, description="half-width of a further offset, drawn per episode")
+    sine_error_rad: float = quantity("rad", 0.0, description="amplitude of an error proportional to sin(angle)")
+    rate_hz: float = quantity("Hz", 100.0, gt=0, description="sample rate; the value is held in between")
+
+
+class MotorEncoder(Model):
+    """Encoder on the motor side: counts per turn of the output and a homing error."""
+
+    counts_per_turn: int | None = quantity("1", None, gt=0, description="counts per output turn; None for continuous")
+    bias_spread_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the homing error, drawn per episode")
+
+
+def quantise(angle: Array, counts_per_turn: int | None) -> Array:
+    """Angle of an encoder with whole counts [rad]; None leaves the angle as it is."""
+    if counts_per_turn is None:
+        return angle
+    step = 2.0 * np.pi / counts_per_turn
+    return np.round(angle / step) * step
+
+
+def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Array) -> Array:
+    """Measured angle of the attitude sensor.
+
+    Args:
+        sensor: Its parameters.
+        angle: True angle, (...) [rad].
+        drawn_bias: Further offset of this episode, (...) [rad].
+        noise: Standard normal samples, (...) [1].
+
+    Returns:
+        (...) [rad].
+    """
+    error = sensor.bias_rad + drawn_bias + sensor.sine_error_rad * np.sin(angle)
+    return angle + error + sensor.noise_rad * noise
+
+
+def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
+    """Whether a sensor of its own rate delivers a new sample at a control step, (n,).
+
+    Step 0, the start of an episode, always does; a sensor faster than the control loop does at every step.
+    """
+    samples_per_step = rate_hz * control_period_s
+    # the small shift keeps a rate that divides the control rate exact in floating point
+    return (step == 0) | (np.floor(step * samples_per_step + 1e-9) > np.floor((step - 1) * samples_per_step + 1e-9))
+
+
+class NoiseStream:
+    """Standard normal samples, one independent stream per world, drawn in blocks.
+
+    World i's samples depend on its generator and on how many it has used, never on the other worlds.
+    """
+
+    def __init__(self, num_worlds: int, width: int, block: int = 250) -> None:
+        self._samples = np.zeros((num_worlds, block, width))
+        self._used = np.zeros(num_worlds, dtype=np.int64)
+        self._generators: list[np.random.Generator] = [np.random.default_rng(0) for _ in range(num_worlds)]
+
+    def restart(self, world: int, generator: np.random.Generator) -> None:
+        """Begin a new stream for one world."""
+        self._generators[world] = generator
+        self._refill(world)
+
+    def next(self, worlds: BoolArray) -> Array:
+        """The next sample of some worlds, (num_worlds, width); the rows of the others are not to be used."""
+        block = self._samples.shape[1]
+        for world in np.flatnonzero(worlds & (self._used == block)):
+            self._refill(int(world))
+        sample = self._samples[np.arange(len(self._used)), np.minimum(self._used, block - 1)]
+        self._used += worlds
+        return sample
+
+    def _refill(self, world: int) -> None:
+        self._samples[world] = self._generators[world].standard_normal(self._samples.shape[1:])
+        self._used[world] = 0

@@ -1,0 +1,67 @@
+"""What a task is: the rules of one environment on (num_worlds, ...) arrays, without any loop over worlds."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from elastic_env.metrics import Metric
+from elastic_env.robots.robot_model import RobotModel
+from elastic_env.signals import Array, BoolArray, SignalTable
+from elastic_env.simulation import Simulation
+
+
+class Task(Protocol):
+    """Rules of an environment. `elastic_env.worlds.Worlds` drives it, in this order, every control step:
+
+    command → (physics) → sense → signals, reward_terms, scored, finished, failed → observe
+    """
+
+    model: mujoco.MjModel
+    num_worlds: int
+    num_substeps: int
+    observation_table: SignalTable
+    action_table: SignalTable
+    metrics: Sequence[Metric]
+    assumed_model: RobotModel
+
+    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+        """Begin new episodes in some worlds, a (num_worlds,) mask; one generator for every world of the batch."""
+        ...
+
+    def command(self, offset: Array) -> Array:
+        """Servo inputs for command offsets, (num_worlds, n) [rad], already within bounds; ctrl, (num_worlds, nu)."""
+        ...
+
+    def sense(self, simulation: Simulation) -> None:
+        """Take truth and measurements of the new state; worlds that diverged keep their last ones."""
+        ...
+
+    def observe(self) -> Array:
+        """A fresh observation, (num_worlds, len(observation_table))."""
+        ...
+
+    def signals(self) -> dict[str, Array]:
+        """Truth and scores of this step by name, (num_worlds,) each."""
+        ...
+
+    def reward_terms(self, signals: Mapping[str, Array], diverged: BoolArray) -> dict[str, Array]:
+        """Weighted terms whose sum is the reward, (num_worlds,) each."""
+        ...
+
+    def scored(self) -> BoolArray:
+        """Worlds whose present step counts in the metrics."""
+        ...
+
+    def finished(self) -> BoolArray:
+        """Worlds whose plan has come to its end."""
+        ...
+
+    def failures(self) -> dict[str, BoolArray]:
+        """Worlds that failed, by reason."""
+        ...
+
+    def truth(self) -> Any:
+        """Noise-free state and true parameters, for rewards, metrics and the oracle."""
+        ...

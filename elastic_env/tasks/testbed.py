@@ -1,0 +1,361 @@
+"""The testbed task: make the link follow a reference although the joint bends under gravity.
+
+Observation of one world (float64):
+
+| column | name | unit | meaning |
+|---|---|---|---|
+| 0 | `encoder_angle` | rad | motor encoder, θ in whole counts |
+| 1 | `encoder_rate` | rad/s | its change over the last control period |
+| 2 | `reference_angle` | rad | q_ref at the end of the coming control period |
+| 3 | `reference_rate` | rad/s | its rate |
+| 4 | `reference_acceleration` | rad/s² | its acceleration |
+| 5 | `last_command` | rad | θ_cmd of the last control period |
+| 6 | `link_angle_imu` | rad | IMU on the link; only with `observe_link=True` |
+
+Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], within ±0.3.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from elastic_env.config import Model, quantity
+from elastic_env.elasticity import ElasticJoint, joint_torque, static_deflection, static_link_angle
+from elastic_env.errors import ConfigurationError
+from elastic_env.metrics import Metric
+from elastic_env.references import Hold, Reference
+from elastic_env.robots.dynamixel import H54_200_S500_R
+from elastic_env.robots.elastic_joint import Form, JointAddresses
+from elastic_env.robots.robot_model import RobotModel
+from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec, rigid_spec
+from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
+from elastic_env.signals import Array, BoolArray, Signal, SignalTable
+from elastic_env.simulation import Simulation
+
+ACTION_BOUND_RAD = 0.3
+"""Largest command offset [rad]."""
+
+ACTION = SignalTable(
+    (Signal("command_offset", "rad", "θ_cmd − q_ref", low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD),)
+)
+
+OBSERVATION = SignalTable(
+    (
+        Signal("encoder_angle", "rad", "motor encoder, θ in whole counts"),
+        Signal("encoder_rate", "rad/s", "its change over the last control period"),
+        Signal("reference_angle", "rad", "q_ref at the end of the coming control period"),
+        Signal("reference_rate", "rad/s", "its rate"),
+        Signal("reference_acceleration", "rad/s²", "its acceleration"),
+        Signal("last_command", "rad", "θ_cmd of the last control period"),
+    )
+)
+
+LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link")
+
+METRICS = (
+    *(Metric(f"link_error_{s}_rad", "link_error", s) for s in ("rms", "peak", "min", "max")),
+    *(Metric(f"link_error_imu_{s}_rad", "link_error_imu", s) for s in ("rms", "min", "max")),
+    *(Metric(f"deflection_{s}_rad", "deflection", s) for s in ("rms", "peak")),
+    *(Metric(f"servo_error_{s}_rad", "servo_error", s) for s in ("rms", "peak")),
+    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, scored_only=False) for s in ("rms", "peak")),
+    Metric("joint_torque_peak_nm", "joint_torque", "peak", scored_only=False),
+    Metric("clipped_share", "clipped", "mean", scored_only=False),
+)
+
+
+class RewardWeights(Model):
+    """Weights of the reward terms; every term is a penalty that grows without saturating."""
+
+    link_error: float = quantity("1/rad", 100.0, ge=0, description="per rad of link error: 1 at 0.01 rad")
+    command_rate: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offset")
+    divergence: float = quantity("1", 200.0, ge=0, description="once, where the simulation diverges")
+
+
+class TestbedConfig(Model):
+    """All of the testbed environment."""
+
+    __test__ = False  # not a test class, although its name says so
+
+    reference: Reference = Hold()
+    scenario: Scenario = make_scenario("nominal")
+    joint: ElasticJoint = H54_200_S500_R
+    """The joint as it is known; the scenario says in what the true one differs."""
+    pendulum: Pendulum = Pendulum()
+    form: Form = "tendon"
+    observe_link: bool = False
+    """Whether the link's IMU is part of the observation."""
+    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
+    timestep_s: float = quantity("s", 5e-4, gt=0, description="physics step")
+    reward: RewardWeights = RewardWeights()
+
+    @property
+    def true_joint(self) -> ElasticJoint:
+        """The joint as the plant has it."""
+        return self.joint.replace(
+            stiffness=self.joint.stiffness * self.scenario.stiffness_scale,
+            coulomb_friction=self.joint.coulomb_friction * self.scenario.friction_scale,
+            viscous_friction=self.joint.viscous_friction * self.scenario.friction_scale,
+            backlash=self.joint.backlash + self.scenario.backlash_rad,
+        )
+
+    @property
+    def true_pendulum(self) -> Pendulum:
+        """The pendulum as the plant has it."""
+        return self.pendulum.with_mass_scaled(self.scenario.pendulum_mass_scale)
+
+    def robot_model(self, joint: ElasticJoint, pendulum: Pendulum) -> RobotModel:
+        """Rigid model and joint of this testbed with the given parameters."""
+        return RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), self.control_period_s)
+
+
+@dataclass(frozen=True)
+class TestbedTruth:
+    """Noise-free state of the testbed, (num_worlds, 1) each, and its true parameters. For scoring and the oracle."""
+
+    __test__ = False
+
+    theta: Array
+    theta_dot: Array
+    q: Array
+    q_dot: Array
+    deflection: Array
+    joint_torque: Array
+    model: RobotModel
+
+
+def tracking_penalty(link_error: Array) -> Array:
+    """−|q_ref − q| [rad]: linear, so that a large error never stops to matter."""
+    return -np.abs(link_error)
+
+
+def smoothness_penalty(command_rate: Array) -> Array:
+    """−|ȧ|, the rate of change of the command offset [rad/s]."""
+    return -np.abs(command_rate)
+
+
+def divergence_penalty(diverged: BoolArray) -> Array:
+    """−1 in the step in which the simulation diverges."""
+    return -diverged.astype(np.float64)
+
+
+class TestbedTask:
+    """Rules of `elastic_env/Testbed-v0`, see `elastic_env.tasks.task.Task`."""
+
+    __test__ = False
+
+    action_table = ACTION
+    metrics = METRICS
+
+    def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
+        _require_feasible(config)
+        self.config = config
+        self.num_worlds = num_worlds
+        self.num_substeps = _num_substeps(config)
+        self.observation_table = SignalTable((*OBSERVATION, LINK_IMU)) if config.observe_link else OBSERVATION
+        self.assumed_model = config.robot_model(config.joint, config.pendulum)
+        self._true_model = config.robot_model(config.true_joint, config.true_pendulum)
+        self.model = elastic_spec(
+            config.true_pendulum, config.true_joint, config.form, config.timestep_s
+        ).compile()
+        self._at = JointAddresses.of(self.model, [JOINT])
+        self._noise = NoiseStream(num_worlds, width=1)
+        self._reference = _ReferenceRows(config, num_worlds)
+        self._step = np.zeros(num_worlds, dtype=np.int64)
+        self._theta, self._theta_dot, self._q, self._q_dot = np.zeros((4, num_worlds))
+        self._encoder, self._encoder_before, self._imu = np.zeros((3, num_worlds))
+        self._shown_encoder, self._shown_encoder_before, self._shown_imu = np.zeros((3, num_worlds))
+        self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds))
+        self._offset, self._offset_before, self._command = np.zeros((3, num_worlds))
+
+    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+        """Place the testbed at rest under zero offset: the servo holds q_ref, the spring is already deflected."""
+        scenario = self.config.scenario
+        for world in np.flatnonzero(worlds):
+            generator = generators[world]
+            self._reference.draw(int(world), generator)
+            self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0)
+            self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
+            self._noise.restart(int(world), np.random.default_rng(generator.integers(2**63)))
+        self._step[worlds] = 0
+        self._offset[worlds] = self._offset_before[worlds] = 0.0
+        self._command[worlds] = self._reference.at(self._step).q[worlds]
+        self._place(simulation, worlds)
+        self._read(simulation, worlds)
+        self._measure(worlds)
+        for shown, measured in ((self._shown_encoder, self._encoder), (self._shown_imu, self._imu)):
+            shown[worlds] = measured[worlds]
+        self._encoder_before[worlds] = self._shown_encoder_before[worlds] = self._encoder[worlds]
+
+    def command(self, offset: Array) -> Array:
+        """θ_cmd = q_ref + offset, as the servo gets it: it knows its angle only up to the homing error."""
+        self._offset_before, self._offset = self._offset, offset[:, 0].copy()
+        self._command = self._reference.at(self._step + 1).q + self._offset
+        return (self._command - self._encoder_bias)[:, None]
+
+    def sense(self, simulation: Simulation) -> None:
+        """Read the new state, then what the sensors show of it."""
+        self._step += 1
+        healthy = ~simulation.diverged()
+        self._read(simulation, healthy)
+        shown = self._encoder.copy(), self._encoder_before.copy(), self._imu.copy()
+        self._encoder_before[healthy] = self._encoder[healthy]
+        self._measure(healthy)
+        if self.config.scenario.delay_steps == 0:
+            shown = self._encoder.copy(), self._encoder_before.copy(), self._imu.copy()
+        self._shown_encoder, self._shown_encoder_before, self._shown_imu = shown
+
+    def observe(self) -> Array:
+        """See the table of the module."""
+        coming = self._reference.at(self._step + 1)
+        rate = (self._shown_encoder - self._shown_encoder_before) / self.config.control_period_s
+        columns = [self._shown_encoder, rate, coming.q, coming.q_dot, coming.q_ddot, self._command]
+        if self.config.observe_link:
+            columns.append(self._shown_imu)
+        return np.stack(columns, axis=-1)
+
+    def signals(self) -> dict[str, Array]:
+        """Truth and scores of this step, (num_worlds,) each."""
+        reference = self._reference.at(self._step)
+        truth = self.truth()
+        return {
+            "time_s": self._step * self.config.control_period_s,
+            "reference_angle": reference.q,
+            "link_angle": self._q.copy(),
+            "link_angle_imu": self._shown_imu.copy(),
+            "link_error": reference.q - self._q,
+            "link_error_imu": reference.q - self._shown_imu,
+            "deflection": truth.deflection[:, 0],
+            "joint_torque": truth.joint_torque[:, 0],
+            "servo_error": self._command - self._encoder_bias - self._theta,
+            "command_rate": (self._offset - self._offset_before) / self.config.control_period_s,
+            "rest": reference.rest,
+        }
+
+    def reward_terms(self, signals: Mapping[str, Array], diverged: BoolArray) -> dict[str, Array]:
+        """Weighted penalties for link error, restless commands and divergence."""
+        weights = self.config.reward
+        return {
+            "link_error": weights.link_error * tracking_penalty(signals["link_error"]),
+            "command_rate": weights.command_rate * smoothness_penalty(signals["command_rate"]),
+            "divergence": weights.divergence * divergence_penalty(diverged),
+        }
+
+    def scored(self) -> BoolArray:
+        """Windows at rest of `hold`; all but standing and onset of the other references."""
+        return self._reference.at(self._step).scored
+
+    def finished(self) -> BoolArray:
+        """The reference has come to its end."""
+        return self._step >= self._reference.num_steps
+
+    def failures(self) -> dict[str, BoolArray]:
+        """A pendulum cannot fall over."""
+        return {}
+
+    def truth(self) -> TestbedTruth:
+        """State without noise, and the true parameters."""
+        joint = self.config.true_joint
+        deflection, deflection_rate = self._theta - self._q, self._theta_dot - self._q_dot
+        torque = joint_torque(deflection, deflection_rate, joint.stiffness, joint.damping, joint.backlash)
+        columns = (self._theta, self._theta_dot, self._q, self._q_dot, deflection, torque)
+        return TestbedTruth(*(column[:, None].copy() for column in columns), model=self._true_model)
+
+    def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
+        joint, pendulum = self.config.true_joint, self.config.true_pendulum
+        theta = (self._command - self._encoder_bias)[worlds, None]
+        q = theta if self.config.form == "rigid" else _rest_angle(theta, joint, pendulum)
+        simulation.qpos[np.ix_(worlds, self._at.theta)] = theta
+        simulation.qpos[np.ix_(worlds, self._at.q)] = q
+        simulation.ctrl[worlds] = theta
+        if joint.servo is not None and joint.servo.integral_gain > 0.0:
+            simulation.act[worlds] = pendulum.torque(q) / joint.servo.integral_gain
+
+    def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
+        at = self._at
+        self._theta[worlds] = simulation.qpos[worlds, at.theta[0]]
+        self._theta_dot[worlds] = simulation.qvel[worlds, at.theta_dot[0]]
+        self._q[worlds] = simulation.qpos[worlds, at.q[0]]
+        self._q_dot[worlds] = simulation.qvel[worlds, at.q_dot[0]]
+
+    def _measure(self, worlds: BoolArray) -> None:
+        scenario, joint = self.config.scenario, self.config.joint
+        counts = joint.encoder_counts_per_turn if scenario.encoder_counts else None
+        self._encoder[worlds] = quantise(self._theta + self._encoder_bias, counts)[worlds]
+        due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
+        measured = attitude(scenario.imu, self._q, self._imu_bias, self._noise.next(due)[:, 0])
+        self._imu[due] = measured[due]
+
+
+@dataclass(frozen=True)
+class _ReferenceRow:
+    """The reference of every world at its present step, (num_worlds,) each."""
+
+    q: Array
+    q_dot: Array
+    q_ddot: Array
+    scored: BoolArray
+    rest: Array
+
+
+class _ReferenceRows:
+    """The plans of all worlds as tables, one row per control step; a plan without randomness is held once."""
+
+    def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
+        self._reference, self._period = config.reference, config.control_period_s
+        probe = self._reference.plan(np.random.default_rng(0), self._period)
+        self.num_steps = probe.num_steps
+        self._is_shared = getattr(self._reference, "seed", 0) is not None
+        self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
+        rows = 1 if self._is_shared else num_worlds
+        self._motion = np.tile(np.stack([probe.q, probe.q_dot, probe.q_ddot], axis=-1), (rows, 1, 1))
+        self._scored, self._rest = probe.scored, probe.rest
+
+    def draw(self, world: int, generator: np.random.Generator) -> None:
+        """A new plan for one world."""
+        if not self._is_shared:
+            plan = self._reference.plan(generator, self._period)
+            self._motion[world] = np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1)
+
+    def at(self, step: Array) -> _ReferenceRow:
+        """Rows of the given steps, (num_worlds,); beyond the end the last row."""
+        row = np.minimum(step, self.num_steps)
+        motion = self._motion[self._row, row]
+        return _ReferenceRow(motion[:, 0], motion[:, 1], motion[:, 2], self._scored[row], self._rest[row])
+
+
+def _rest_angle(theta: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
+    """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
+    half = static_deflection(np.sign(theta), np.inf, joint.backlash)
+    engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
+    return static_link_angle(engaged, joint.stiffness, pendulum.torque, pendulum.torque_gradient)
+
+
+def _num_substeps(config: TestbedConfig) -> int:
+    ratio = config.control_period_s / config.timestep_s
+    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+        raise ConfigurationError(
+            f"control_period_s must be a multiple of timestep_s, got {config.control_period_s} s and {config.timestep_s} s"
+        )
+    return round(ratio)
+
+
+def _require_feasible(config: TestbedConfig) -> None:
+    """A reference that the servo cannot follow is an error now, not a poor result later."""
+    joint, pendulum, extent = config.true_joint, config.true_pendulum, config.reference.extent()
+    if joint.servo is None:
+        raise ConfigurationError("the testbed's joint needs a servo, got None; see elastic_env.elasticity.Servo")
+    worst_angle = min(extent.q, np.pi / 2)
+    needed = (
+        abs(float(pendulum.torque(np.array(worst_angle))))
+        + (pendulum.inertia + joint.rotor_inertia) * extent.q_ddot
+        + joint.coulomb_friction
+        + joint.viscous_friction * extent.q_dot
+    )
+    if needed > joint.servo.torque_limit:
+        raise ConfigurationError(
+            f"the reference {config.reference.kind!r} can need {needed:.1f} N·m of a servo limited to "
+            f"{joint.servo.torque_limit:.1f} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to {extent.q_ddot:.2f} rad/s²); "
+            "lower its amplitude or its rate"
+        )

@@ -1,0 +1,109 @@
+"""N worlds of one task: the control step that scalar and vector environments share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.errors import ActionError
+from elastic_env.metrics import EpisodeMetrics
+from elastic_env.signals import Array, BoolArray
+from elastic_env.simulation import simulate
+from elastic_env.tasks.task import Task
+
+DIVERGED = "diverged"
+"""Reason of termination where the simulation produced a bad number; MuJoCo alone would restart it silently."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Result of a control step, one row per world."""
+
+    observation: Array
+    reward: Array
+    terminated: BoolArray
+    truncated: BoolArray
+    info: dict[str, Any]
+
+    @property
+    def done(self) -> BoolArray:
+        """Worlds whose episode is over."""
+        return self.terminated | self.truncated
+
+
+class Worlds:
+    """Runs a task in many worlds: checks actions, advances physics, adds up rewards and metrics, finds the ends.
+
+    Args:
+        task: The rules.
+        num_threads: Threads of the physics, 0 for all cores; results do not depend on it.
+    """
+
+    def __init__(self, task: Task, num_threads: int = 0) -> None:
+        self.task = task
+        self.simulation = simulate(task.model, task.num_worlds, num_threads)
+        self._bound = task.action_table.space(np.float32).high.astype(np.float64)
+        self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
+
+    @property
+    def num_worlds(self) -> int:
+        """Number of worlds."""
+        return self.task.num_worlds
+
+    def restart(self, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+        """Begin new episodes in some worlds, a (num_worlds,) mask, each from its own generator."""
+        self.simulation.restart(worlds)
+        self.task.restart(self.simulation, worlds, generators)
+        self._metrics.restart(worlds)
+
+    def step(self, action: npt.ArrayLike) -> Transition:
+        """One control period under the actions, (num_worlds, n) [rad].
+
+        Raises:
+            ActionError: Wrong shape, or a value that is not finite.
+        """
+        requested = self._checked(action)
+        offset = np.clip(requested, -self._bound, self._bound)
+        self.simulation.ctrl[:] = self.task.command(offset)
+        self.simulation.advance(self.task.num_substeps)
+        diverged = self.simulation.diverged()
+        self.task.sense(self.simulation)
+        signals = self.task.signals()
+        signals["clipped"] = (requested != offset).any(axis=1).astype(np.float64)
+        self._metrics.update(signals, self.task.scored() & ~diverged)
+        terms = self.task.reward_terms(signals, diverged)
+        failures = {DIVERGED: diverged, **self.task.failures()}
+        terminated = np.logical_or.reduce(list(failures.values()))
+        truncated = self.task.finished() & ~terminated
+        info: dict[str, Any] = {**signals, "reward_terms": terms, "termination": _reasons(failures, self.num_worlds)}
+        if (terminated | truncated).any():
+            info["episode_metrics"] = {**self._metrics.values(), DIVERGED: diverged.copy()}
+        reward = np.sum(list(terms.values()), axis=0)
+        return Transition(self.task.observe(), reward, terminated, truncated, info)
+
+    def _checked(self, action: npt.ArrayLike) -> Array:
+        values = np.asarray(action, dtype=np.float64)
+        shape = (self.num_worlds, len(self._bound))
+        if values.shape != shape:
+            expected = shape[1:] if self.num_worlds == 1 else shape
+            given = values.shape[1:] if self.num_worlds == 1 and values.ndim > 0 else values.shape
+            raise ActionError(
+                f"an action must have shape {expected} [rad], within ±{self._bound.max():g} rad; got shape {given}"
+            )
+        if not np.isfinite(values).all():
+            worlds = np.flatnonzero(~np.isfinite(values).all(axis=1))
+            raise ActionError(
+                f"an action must be finite, within ±{self._bound.max():g} rad, shape {shape[1:]} a world; "
+                f"got {values[worlds[0]]} in world {worlds[0]}"
+            )
+        return values
+
+
+def _reasons(failures: dict[str, BoolArray], num_worlds: int) -> npt.NDArray[np.str_]:
+    """Reason of termination of every world, the first that applies, "" where there is none."""
+    reasons = np.full(num_worlds, "", dtype=f"<U{max(map(len, failures))}")
+    for reason, failed in reversed(failures.items()):
+        reasons[failed] = reason
+    return reasons
