@@ -30,13 +30,22 @@ class Servo(Model):
     .. math:: \tau_m = \mathrm{clip}(k_p (u - \theta) - k_v \dot\theta + k_i \textstyle\int (u - \theta) dt, \pm \tau_{max})
 
     A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like this PID. The
-    integrator lets it hold its angle without steady-state error; it is clamped to the torque limit.
+    integrator lets it hold its angle without steady-state error. Against wind-up it is clamped to what it can be
+    needed for: the torque limit on top of k_v θ̇ at the speed limit.
     """
 
     position_gain: float = quantity("N·m/rad", gt=0, description="k_p, position gain")
     velocity_gain: float = quantity("N·m·s/rad", 0.0, ge=0, description="k_v, velocity gain")
     integral_gain: float = quantity("N·m/(rad·s)", 0.0, ge=0, description="k_i, integral gain, 0 for none")
     torque_limit: float = quantity("N·m", gt=0, description="largest torque of the servo at the output")
+    speed_limit: float = quantity("rad/s", gt=0, description="no-load speed of the servo at the output")
+
+    @property
+    def integral_limit(self) -> float:
+        """Largest magnitude of the integral of the position error [rad·s]; 0 without an integrator."""
+        if self.integral_gain == 0.0:
+            return 0.0
+        return (self.torque_limit + self.velocity_gain * self.speed_limit) / self.integral_gain
 
 
 class ElasticJoint(Model):

@@ -20,6 +20,7 @@ from elastic_env.robots.robot_model import RobotModel, read_stiffness
 from elastic_env.robots.testbed import Pendulum
 from elastic_env.scenario import Scenario, make_scenario
 from elastic_env.signals import Array, BoolArray
+from elastic_env.simulation import Simulation
 from elastic_env.tasks.task import Task
 from elastic_env.tasks.testbed import TestbedConfig, TestbedTask
 from elastic_env.worlds import Transition, Worlds
@@ -30,7 +31,32 @@ Action = npt.NDArray[np.float32]
 RENDER_MODES = ("rgb_array", "human")
 
 
-class ElasticEnv(gymnasium.Env[Observation, Action]):
+class _Faces:
+    """What both environments show of their worlds."""
+
+    _worlds: Worlds
+
+    @property
+    def assumed_model(self) -> RobotModel:
+        """What a compensator may know of the robot."""
+        return self._worlds.task.assumed_model
+
+    @property
+    def task(self) -> Task:
+        """The rules of this environment."""
+        return self._worlds.task
+
+    @property
+    def simulation(self) -> Simulation:
+        """The physics, for benchmarks and tests; a policy has no business here."""
+        return self._worlds.simulation
+
+    def truth(self) -> Any:
+        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
+        return self._worlds.task.truth()
+
+
+class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
     """One world of a task.
 
     Args:
@@ -51,20 +77,6 @@ class ElasticEnv(gymnasium.Env[Observation, Action]):
         self.action_space = task.action_table.space(np.float32)
         self._worlds = Worlds(task, num_threads=1)
         self._make_picture, self._picture = picture, None
-
-    @property
-    def assumed_model(self) -> RobotModel:
-        """What a compensator may know of the robot."""
-        return self._worlds.task.assumed_model
-
-    @property
-    def task(self) -> Task:
-        """The rules of this environment."""
-        return self._worlds.task
-
-    def truth(self) -> Any:
-        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
-        return self._worlds.task.truth()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -107,7 +119,7 @@ class ElasticEnv(gymnasium.Env[Observation, Action]):
             self._draw().show(self._worlds.task.signals())
 
 
-class ElasticVectorEnv(gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]):
+class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]):
     """Many worlds of a task on a thread pool.
 
     World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever the number of worlds
@@ -133,20 +145,6 @@ class ElasticVectorEnv(gymnasium.vector.VectorEnv[Observation, Action, npt.NDArr
         self._worlds = Worlds(task, num_threads)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
-
-    @property
-    def assumed_model(self) -> RobotModel:
-        """What a compensator may know of the robot."""
-        return self._worlds.task.assumed_model
-
-    @property
-    def task(self) -> Task:
-        """The rules of this environment."""
-        return self._worlds.task
-
-    def truth(self) -> Any:
-        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
-        return self._worlds.task.truth()
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None

@@ -80,16 +80,20 @@ def _times(duration_s: float, control_period_s: float) -> Array:
 class Hold(Model):
     """The paper's static positions, evenly spaced in gravity torque, approached from below and then from above.
 
+    Without compensation the link sags below its reference; the references lie so far beyond the positions that the
+    uncompensated link rests at evenly spaced torques.
+
     The sweep starts below the first position and turns round beyond the last, so that every position is reached from
     both sides. Moves are slow: a link that overshoots would lose the friction's hysteresis, which the experiment shows.
     """
 
     kind: Literal["hold"] = "hold"
-    positions: int = quantity("1", 24, ge=2, description="number of static positions")
+    positions: int = quantity("1", 20, ge=2, description="number of static positions")
     lower: float = quantity("1", -0.875, gt=-1, lt=1, description="first position, as a share of the torque at horizontal")
     upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
-    rate: float = quantity("rad/s", 0.1, gt=0, description="peak rate of the moves")
-    settle_s: float = quantity("s", 1.0, ge=0, description="time at rest before the measurement")
+    rate: float = quantity("rad/s", 0.06, gt=0, description="peak rate of the moves")
+    sag: float = quantity("rad", 60 / 1001, ge=0, description="deflection at the horizontal without compensation")
+    settle_s: float = quantity("s", 1.5, ge=0, description="time at rest before the measurement")
     measure_s: float = quantity("s", 0.5, gt=0, description="time of the measurement")
     overrun: float = quantity("rad", 0.08, gt=0, description="how far the sweep starts and turns outside the positions")
 
@@ -101,8 +105,9 @@ class Hold(Model):
 
     @property
     def angles(self) -> Array:
-        """Static positions, (positions,) [rad], for τ_g proportional to sin q."""
-        return np.arcsin(np.linspace(self.lower, self.upper, self.positions))
+        """References of the static positions, (positions,) [rad], for τ_g proportional to sin q."""
+        shares = np.linspace(self.lower, self.upper, self.positions)
+        return np.arcsin(shares) + self.sag * shares
 
     @property
     def visits(self) -> tuple[Array, IntArray]:
@@ -201,6 +206,7 @@ class Multisine(_Oscillation):
     """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode; their sum stays inside."""
 
     kind: Literal["multisine"] = "multisine"
+    amplitude: float = quantity("rad", 0.4, gt=0, lt=np.pi, description="largest angle from the middle")
     lowest_hz: float = quantity("Hz", 0.1, gt=0, description="lowest frequency")
     highest_hz: float = quantity("Hz", 1.0, gt=0, description="highest frequency")
     components: int = quantity("1", 5, ge=2, description="number of sines")
@@ -239,8 +245,8 @@ class Steps(Model):
     kind: Literal["steps"] = "steps"
     amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
     middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="middle of the levels")
-    move_s: float = quantity("s", 0.8, gt=0, description="duration of a move")
-    rest_s: float = quantity("s", 1.2, ge=0, description="rest after a move")
+    move_s: float = quantity("s", 1.0, gt=0, description="duration of a move")
+    rest_s: float = quantity("s", 1.0, ge=0, description="rest after a move")
     moves: int = quantity("1", 5, ge=1, description="number of moves")
     seed: int | None = quantity("1", None, ge=0, description="seed of the levels; None draws new ones per episode")
 

@@ -8,10 +8,13 @@
 | backlash | below 1.75 mrad | ROBOTIS e-manual, H54-200-S500-R: 6 arcmin; 0 by default, the bound in scenario `backlash` |
 | encoder | 501,923 counts/turn | ROBOTIS e-manual; 1000 per motor turn, so it sits on the motor side |
 | torque | 84 N·m | current limit of 1240 counts = 20 A (THORMANG3 leg servos) on the measured line 4.338 N·m/A − 2.694 N·m |
+| speed | 3.47 rad/s | ROBOTIS e-manual: 33.1 rpm without load |
 | D | 10 N·m·s/rad | our assumption: not published; `docs/testbed.md` shows the sensitivity from 5 to 50 |
 | servo | 18000, 250 | position gain and upper joint damping of the DYROS-JET MuJoCo model; scaling of the real gains unpublished |
 | integrator | 0.1 s | our assumption: the real cascade has one, its time constant is not published |
 """
+
+import math
 
 from elastic_env.elasticity import ElasticJoint, Servo
 
@@ -32,6 +35,7 @@ SERVO = Servo(
     velocity_gain=250.0,
     integral_gain=_POSITION_GAIN / _INTEGRATOR_TIME_S,
     torque_limit=round(4.338 * _CURRENT_LIMIT_A - 2.694, 1),
+    speed_limit=round(33.1 * 2.0 * math.pi / 60.0, 2),
 )
 
 H54_200_S500_R = ElasticJoint(

@@ -256,7 +256,7 @@ def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> Non
         kp=servo.position_gain,
         kv=servo.velocity_gain,
         ki=servo.integral_gain,
-        imax=servo.torque_limit / servo.integral_gain if servo.integral_gain > 0.0 else 0.0,
+        imax=servo.integral_limit,
         ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
     )
     actuator.gear = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -54,6 +54,11 @@ class RobotModel:
         return self._values("backlash")
 
     @property
+    def coulomb_friction(self) -> Array:
+        """Coulomb friction on the links, (n,) [N·m]."""
+        return self._values("coulomb_friction")
+
+    @property
     def viscous_friction(self) -> Array:
         """Viscous friction on the links, (n,) [N·m·s/rad]."""
         return self._values("viscous_friction")

@@ -26,6 +26,11 @@ class Task(Protocol):
     metrics: Sequence[Metric]
     assumed_model: RobotModel
 
+    @property
+    def num_steps(self) -> int:
+        """Control steps of an episode that does not fail."""
+        ...
+
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes in some worlds, a (num_worlds,) mask; one generator for every world of the batch."""
         ...

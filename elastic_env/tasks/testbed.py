@@ -169,6 +169,11 @@ class TestbedTask:
         self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds))
         self._offset, self._offset_before, self._command = np.zeros((3, num_worlds))
 
+    @property
+    def num_steps(self) -> int:
+        """Control steps of an episode."""
+        return self._reference.num_steps
+
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place the testbed at rest under zero offset: the servo holds q_ref, the spring is already deflected."""
         scenario = self.config.scenario

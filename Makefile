@@ -1,0 +1,85 @@
+# Each target sets up what it needs: a virtual environment in .venv with the versions of constraints.txt. That happens
+# once, and again only after pyproject.toml or constraints.txt have changed.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+# Pictures without a display: MuJoCo draws through EGL, on Linux the library libEGL of Mesa or of the GPU's driver.
+ifeq ($(shell uname -s),Linux)
+MUJOCO_GL ?= egl
+export MUJOCO_GL
+endif
+
+define NO_GL
+Warning: MuJoCo cannot draw with MUJOCO_GL="$(MUJOCO_GL)"; without libEGL, "egl" fails at import already. On Debian or Ubuntu:
+    apt-get install libegl1 libgl1-mesa-dri
+To compute without pictures, set MUJOCO_GL=disable.
+endef
+export NO_GL
+
+define WRONG_PYTHON
+elastic-env needs Python 3.11, 3.12 or 3.13, and "$(PYTHON)" is none of them. Name one that is, for example:
+    make $(or $(firstword $(MAKECMDGOALS)),test) PYTHON=python3.11
+endef
+export WRONG_PYTHON
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format typecheck bench check-gl clean
+
+help: ## Show this text
+	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
+	@echo
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@echo
+	@echo "The first call sets up $(VENV), which takes some minutes; later calls install nothing. Variables:"
+	@echo
+	@echo "  make demo PYTHON=python3.12             which Python $(VENV) is made with: 3.11, 3.12 or 3.13"
+	@echo "  make test ARGS='-k stiffness -x'        arguments for pytest"
+	@echo "  make demo MUJOCO_GL=osmesa              how MuJoCo draws: egl (default on Linux), glfw, osmesa, disable"
+	@echo
+	@echo "The command line behind it: $(BIN)/elastic --help"
+
+demo: $(STAMP) check-gl ## The testbed end to end: identify the spring, compensate it, show table and figures
+	$(BIN)/elastic demo
+
+test: $(STAMP) check-gl ## Run the tests, without network or display
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP) ## Check style, format and types; changes nothing
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: $(STAMP) ## Format the code and repair what ruff can repair
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+typecheck: $(STAMP) ## Check types only
+	$(BIN)/pyright
+
+bench: $(STAMP) ## Measure the speed of the simulation, then run the benchmarks if there are any
+	$(BIN)/elastic speed
+	$(if $(wildcard tests/benchmarks),$(BIN)/python -m pytest -o addopts= --benchmark-only tests/benchmarks $(ARGS))
+
+check-gl: $(STAMP)
+	@test "$$MUJOCO_GL" = disable || $(BIN)/python -c 'import mujoco; mujoco.GLContext(16, 16).free()' >/dev/null 2>&1 || echo "$$NO_GL" >&2
+
+clean: ## Remove the virtual environment and all caches; results under runs/ stay
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# An existing .venv is kept if it has pip and the wanted Python, and made anew otherwise. Setuptools comes first and
+# builds the package itself, so that this step too uses the tested version.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || { echo "$$WRONG_PYTHON" >&2; exit 1; }
+	@version=$$($(PYTHON) -c 'import sys; print(*sys.version_info[:2], sep=".")'); \
+	case "$$($(BIN)/python -m pip --version 2>/dev/null)" in \
+	    *"(python $$version)"*) ;; \
+	    *) echo "Making $(VENV) with Python $$version"; $(PYTHON) -m venv --clear $(VENV) ;; \
+	esac
+	@echo "Installing the versions of constraints.txt into $(VENV), once; this takes some minutes"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt setuptools wheel
+	$(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[dev]'
+	@touch $@

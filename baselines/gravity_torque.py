@@ -1,0 +1,120 @@
+"""Gravity torque of the assumed rigid model: what the compensators turn into a deflection.
+
+`gravity_torque(q)` and its gradient on (..., n) joint angles, from Pinocchio (the reference, row by row) or from
+NumPy for a whole batch at once. Both agree to rounding.
+"""
+
+from typing import Literal, Protocol, get_args
+
+import mujoco
+import numpy as np
+
+from elastic_env.errors import unknown_name
+from elastic_env.rigid_body import RigidBody
+from elastic_env.robots.robot_model import RobotModel
+from elastic_env.signals import Array
+
+GravityMethod = Literal["pinocchio", "batched"]
+
+
+class GravityModel(Protocol):
+    """Torque that holds the robot at rest, and its gradient."""
+
+    def gravity_torque(self, q: Array) -> Array:
+        """τ_g, (..., n) [rad] to (..., n) [N·m]."""
+        ...
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
+        ...
+
+
+def make_gravity(model: RobotModel, method: GravityMethod = "pinocchio") -> GravityModel:
+    """The gravity torque of a robot model by a chosen method.
+
+    Raises:
+        ConfigurationError: The method does not exist.
+    """
+    if method == "pinocchio":
+        return RigidBody(model.rigid, model.joint_names)
+    if method == "batched":
+        return BatchedGravity(model)
+    raise unknown_name("gravity method", method, get_args(GravityMethod))
+
+
+class BatchedGravity:
+    r"""Gravity torque of a tree of hinges in NumPy, without a loop over the rows of a batch.
+
+    With axis z_i and anchor a_i of joint i, and mass m_i and first moment s_i = Σ m c of all that it carries:
+
+    .. math:: \tau_i = -g \cdot (z_i \times (s_i - m_i a_i)), \quad
+              \partial\tau_i/\partial q_j = -g \cdot (z_i \times (z_j \times (s_j - m_j a_j)))
+
+    for j carried by i (the gradient is symmetric, and zero for joints on different branches).
+    """
+
+    def __init__(self, model: RobotModel) -> None:
+        self._rigid = model.rigid
+        self._joints = [model.rigid.joint(name).id for name in model.joint_names]
+        self._carried = np.array([[_carries(model.rigid, i, j) for j in self._joints] for i in self._joints])
+
+    def gravity_torque(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        axes, levers = self._moments(q)
+        return -(np.cross(axes, levers) @ self._rigid.opt.gravity)
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        axes, levers = self._moments(q)
+        turned = np.cross(axes, levers)  # z_j × (s_j − m_j a_j), (..., n, 3)
+        below = -np.cross(axes[..., :, None, :], turned[..., None, :, :]) @ self._rigid.opt.gravity
+        return np.where(self._carried, below, np.where(self._carried.T, below.swapaxes(-1, -2), 0.0))
+
+    def _moments(self, q: Array) -> tuple[Array, Array]:
+        """Axis z_i and lever s_i − m_i a_i of every joint, (..., n, 3) each, in the world frame."""
+        m, batch = self._rigid, q.shape[:-1]
+        angle = dict(zip(self._joints, np.moveaxis(q, -1, 0), strict=True))
+        R_wb, p_wb = {0: np.broadcast_to(np.eye(3), (*batch, 3, 3))}, {0: np.zeros((*batch, 3))}
+        axis, anchor = {}, {}
+        first_moment = np.zeros((m.nbody, *batch, 3))
+        for b in range(1, m.nbody):
+            parent = int(m.body_parentid[b])
+            R = R_wb[parent] @ _matrix(m.body_quat[b])
+            p = p_wb[parent] + R_wb[parent] @ m.body_pos[b]
+            for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]):
+                anchor[j], axis[j] = p + R @ m.jnt_pos[j], R @ m.jnt_axis[j]
+                R = R @ _rotation(m.jnt_axis[j], angle[j] - m.qpos0[m.jnt_qposadr[j]])
+                p = anchor[j] - R @ m.jnt_pos[j]
+            R_wb[b], p_wb[b] = R, p
+            first_moment[b] = m.body_mass[b] * (p + R @ m.body_ipos[b])
+        for b in range(m.nbody - 1, 0, -1):  # children come after their parents
+            first_moment[m.body_parentid[b]] += first_moment[b]
+        body = m.jnt_bodyid
+        levers = [first_moment[body[j]] - m.body_subtreemass[body[j]] * anchor[j] for j in self._joints]
+        return np.stack([axis[j] for j in self._joints], axis=-2), np.stack(levers, axis=-2)
+
+
+def _carries(model: mujoco.MjModel, i: int, j: int) -> bool:
+    """Whether joint i carries joint j, or is it."""
+    if model.jnt_bodyid[i] == model.jnt_bodyid[j]:
+        return i <= j
+    body = int(model.jnt_bodyid[j])
+    while body != 0:
+        body = int(model.body_parentid[body])
+        if body == model.jnt_bodyid[i]:
+            return True
+    return False
+
+
+def _rotation(axis: Array, angle: Array) -> Array:
+    """Rotation about a unit axis, (...) [rad] to (..., 3, 3), by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, versine = np.sin(angle)[..., None, None], (1.0 - np.cos(angle))[..., None, None]
+    return np.eye(3) + sine * cross + versine * (cross @ cross)
+
+
+def _matrix(quaternion: Array) -> Array:
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)

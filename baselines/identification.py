@@ -1,0 +1,308 @@
+r"""Stiffness of an elastic joint from static positions: deflection against gravity torque (Fig. 5 of the paper).
+
+The joint is driven to positions from both sides and left to settle; encoder and IMU are averaged. Of link angle q and
+encoder θ the regression is
+
+.. math:: \theta_i - q_i = \frac{1}{K} (\tau_i + F d_i) + \frac{b}{2}\,\mathrm{sign}(\tau_i + F d_i) + c
+
+with the gravity torque τ at the *link* angle, the direction of approach d = ±1 (friction F), the dead band b and an
+offset c between IMU and encoder. A plain line is biased: by −2 to −3 % with 1.75 mrad of backlash, by +4 % with τ taken at
+the encoder angle. With two known masses, c₁ sin q separates an IMU error of that shape from K.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from baselines.gravity_torque import GravityModel, make_gravity
+from elastic_env.config import Model
+from elastic_env.errors import ConfigurationError, ElasticError
+from elastic_env.signals import Array, IntArray
+
+HYSTERESIS_RESOLUTION_RAD = 1e-4
+"""Differences between the directions of approach below this are not called hysteresis [rad]."""
+
+_SIGN_ITERATIONS = 5
+_RESAMPLES = 999
+
+
+@dataclass(frozen=True)
+class StaticPoints:
+    """Averages of the windows at rest, one entry per visit.
+
+    Attributes:
+        theta: Encoder [rad].
+        q: IMU on the link [rad].
+        direction: Side of approach, +1 from below, -1 from above.
+        position: Number of the static position; its two visits share it.
+        load: Which of the masses was mounted, 0 or 1.
+    """
+
+    theta: Array
+    q: Array
+    direction: IntArray
+    position: IntArray
+    load: IntArray
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    @staticmethod
+    def joined(parts: "Sequence[StaticPoints]") -> "StaticPoints":
+        """The points of several loads together, positions numbered through."""
+        first = np.concatenate([[0], np.cumsum([part.position.max() + 1 for part in parts])[:-1]])
+        return StaticPoints(
+            theta=np.concatenate([part.theta for part in parts]),
+            q=np.concatenate([part.q for part in parts]),
+            direction=np.concatenate([part.direction for part in parts]),
+            position=np.concatenate([part.position + start for part, start in zip(parts, first, strict=True)]),
+            load=np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)]),
+        )
+
+
+class Identification(Model):
+    """Result of an identification; written as `identification.json`, which env and compensator take as their K."""
+
+    stiffness_nm_per_rad: float
+    stiffness_low_nm_per_rad: float
+    """Lower end of the 95 % interval (bootstrap over positions)."""
+    stiffness_high_nm_per_rad: float
+    friction_nm: float
+    dead_band_rad: float
+    offset_rad: float
+    """θ − q without torque: homing error of the encoder less that of the IMU."""
+    imu_sine_error_rad: float | None
+    """Amplitude of an IMU error proportional to sin q; None with a single mass, which cannot tell it from K."""
+    line_stiffness_nm_per_rad: float
+    """K of a plain line through all points."""
+    pearson_r: float
+    residual_rad: float
+    """Standard deviation of the residuals."""
+    hysteresis: bool
+    """Whether the two directions of approach differ: the 95 % interval of the friction excludes zero, and the
+    difference 2 F/K exceeds `HYSTERESIS_RESOLUTION_RAD`."""
+    friction_low_nm: float
+    friction_high_nm: float
+    points: int
+    positions: int
+
+    @property
+    def half_width(self) -> float:
+        """Half-width of the interval of K relative to K."""
+        return (self.stiffness_high_nm_per_rad - self.stiffness_low_nm_per_rad) / (2.0 * self.stiffness_nm_per_rad)
+
+    def save(self, path: Path) -> None:
+        """Write the JSON file."""
+        path.write_text(self.model_dump_json(indent=2) + "\n")
+
+    @staticmethod
+    def load(path: Path) -> "Identification":
+        """Read the JSON file."""
+        return Identification.model_validate_json(path.read_text())
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Coefficients of the regression: compliance 1/K, F/K, b/2, c, and with two loads the sine error."""
+
+    coefficients: Array
+    residuals: Array
+
+    @property
+    def stiffness(self) -> float:
+        """K [N·m/rad]."""
+        return float(1.0 / self.coefficients[0])
+
+    @property
+    def friction(self) -> float:
+        """F [N·m]."""
+        return float(self.coefficients[1] / self.coefficients[0])
+
+
+def fit_points(points: StaticPoints, torque: Array, with_sine_error: bool) -> Fit:
+    """Least squares of the deflections; the sign of the load, which depends on the friction, by iteration.
+
+    Args:
+        points: Static points.
+        torque: Gravity torque at the link angles, (len(points),) [N·m].
+        with_sine_error: Whether an IMU error proportional to sin q is a regressor.
+    """
+    deflection = points.theta - points.q
+    direction = points.direction.astype(np.float64)
+    friction = 0.0
+    coefficients, design = np.zeros(4), np.zeros((len(points), 4))
+    for _ in range(_SIGN_ITERATIONS):
+        columns = [torque, direction, np.sign(torque + friction * direction), np.ones(len(points))]
+        if with_sine_error:
+            columns.append(np.sin(points.q))
+        design = np.stack(columns, axis=1)
+        coefficients = np.linalg.lstsq(design, deflection, rcond=None)[0]
+        friction = coefficients[1] / coefficients[0]
+    return Fit(coefficients, deflection - design @ coefficients)
+
+
+def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed: int = 0) -> Identification:
+    """K, friction, dead band and offset of static points, with intervals from resampled positions.
+
+    Args:
+        points: Static points of one or two loads.
+        gravity: Gravity torque of the rigid model for each load.
+        seed: Seed of the resampling.
+
+    Raises:
+        ElasticError: Too few positions, or the points do not determine the parameters.
+    """
+    positions = np.unique(points.position)
+    if len(positions) < 5 or len(np.unique(points.direction)) < 2:
+        raise ElasticError(
+            f"an identification needs at least 5 positions approached from both sides, got {len(positions)} positions "
+            f"and the directions {np.unique(points.direction).tolist()}"
+        )
+    with_sine_error = len(gravity) > 1
+    torque = _link_torque(points, gravity, with_sine_error)
+    fit = fit_points(points, torque, with_sine_error)
+    rows = [np.flatnonzero(points.position == position) for position in positions]
+
+    def statistics(chosen: IntArray) -> tuple[float, float]:
+        visits = np.concatenate([rows[i] for i in chosen])
+        resampled = fit_points(_subset(points, visits), torque[visits], with_sine_error)
+        return resampled.stiffness, resampled.friction
+
+    interval = stats.bootstrap(
+        (np.arange(len(positions)),), statistics, n_resamples=_RESAMPLES, vectorized=False, method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval  # fmt: skip
+    line = stats.linregress(torque, points.theta - points.q)
+    return Identification(
+        stiffness_nm_per_rad=fit.stiffness,
+        stiffness_low_nm_per_rad=float(interval.low[0]),
+        stiffness_high_nm_per_rad=float(interval.high[0]),
+        friction_nm=fit.friction,
+        friction_low_nm=float(interval.low[1]),
+        friction_high_nm=float(interval.high[1]),
+        dead_band_rad=float(2.0 * fit.coefficients[2]),
+        offset_rad=float(fit.coefficients[3]),
+        imu_sine_error_rad=-float(fit.coefficients[4]) if with_sine_error else None,
+        line_stiffness_nm_per_rad=float(1.0 / line.slope),
+        pearson_r=float(line.rvalue),
+        residual_rad=float(np.std(fit.residuals, ddof=len(fit.coefficients))),
+        hysteresis=bool(interval.low[1] > 0.0 or interval.high[1] < 0.0)
+        and 2.0 * abs(fit.coefficients[1]) > HYSTERESIS_RESOLUTION_RAD,
+        points=len(points),
+        positions=len(positions),
+    )
+
+
+class HoldRecorder:
+    """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations and infos alone.
+
+    Args:
+        visits: Directions of approach of the windows, as `Hold.visits` has them.
+    """
+
+    def __init__(self, visits: IntArray) -> None:
+        self._directions = visits
+        self._sums = np.zeros((len(visits), 2))
+        self._counts = np.zeros(len(visits), dtype=np.int64)
+
+    def take(self, encoder: float, imu: float, rest: int) -> None:
+        """One control step: encoder [rad], IMU [rad], and the number of the window, -1 outside."""
+        if rest >= 0:
+            self._sums[rest] += encoder, imu
+            self._counts[rest] += 1
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every window has been visited."""
+        return bool(self._counts.all())
+
+    def points(self) -> StaticPoints:
+        """The averages.
+
+        Raises:
+            ElasticError: A window has no sample: the run ended early.
+        """
+        if not self.is_complete:
+            raise ElasticError(f"the run ended before all {len(self._counts)} static positions were visited")
+        theta, q = (self._sums / self._counts[:, None]).T
+        half = len(self._directions) // 2
+        position = np.concatenate([np.arange(half), np.arange(half)[::-1]])
+        return StaticPoints(theta, q, self._directions, position, np.zeros(len(theta), dtype=np.int64))
+
+
+def record_points(env: Any, seed: int | None = None, progress: Any = None) -> StaticPoints:
+    """Drive a scalar testbed, simulated or real, through its `hold` reference without compensation.
+
+    Args:
+        env: Testbed environment with reference "hold".
+        seed: Seed of the episode.
+        progress: Called with the share of the episode that is done, after every step.
+
+    Raises:
+        ConfigurationError: The environment's reference has no static positions.
+        ElasticError: The episode ended early.
+    """
+    reference = env.unwrapped.task.config.reference
+    if not hasattr(reference, "visits"):
+        raise ConfigurationError(f"identification needs the reference 'hold', the environment has {reference.kind!r}")
+    recorder = HoldRecorder(reference.visits[1])
+    encoder = env.unwrapped.task.observation_table.names.index("encoder_angle")
+    zero = np.zeros(env.action_space.shape, dtype=np.float32)
+    env.reset(seed=seed)
+    total = env.unwrapped.task.num_steps
+    for step in range(total):
+        observation, _, terminated, truncated, info = env.step(zero)
+        recorder.take(observation[encoder], info["link_angle_imu"], info["rest"])
+        if progress is not None:
+            progress((step + 1) / total)
+        if terminated or truncated:
+            break
+    return recorder.points()
+
+
+def identify(envs: Sequence[Any], seed: int | None = None, progress: Any = None) -> tuple[Identification, StaticPoints]:
+    """Identify the joint of one testbed environment, or of two that differ in a known mass.
+
+    Args:
+        envs: One or two scalar testbeds with reference "hold".
+        seed: Seed of the episodes and of the resampling.
+        progress: Called with the share of the work that is done.
+
+    Returns:
+        The result, and the points that it is made of.
+    """
+    if len(envs) not in {1, 2}:
+        raise ConfigurationError(f"identification takes one environment or two with different masses, got {len(envs)}")
+    parts = []
+    for number, env in enumerate(envs):
+        part = None if progress is None else (lambda share, n=number: progress((n + share) / len(envs)))
+        parts.append(record_points(env, seed, part))
+    points = StaticPoints.joined(parts)
+    gravity = [make_gravity(env.unwrapped.assumed_model) for env in envs]
+    return identify_points(points, gravity, seed=seed or 0), points
+
+
+def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], offset: float = 0.0) -> Array:
+    """Gravity torque at the link angles, each under its load, (len(points),) [N·m]; offset as in `Identification`."""
+    torque = np.empty(len(points))
+    for load, model in enumerate(gravity):
+        rows = points.load == load
+        torque[rows] = model.gravity_torque((points.q + offset)[rows, None])[:, 0]
+    return torque
+
+
+def _link_torque(points: StaticPoints, gravity: Sequence[GravityModel], with_sine_error: bool) -> Array:
+    """Torque at the link angles, the IMU read in the encoder's zero: q + c, with c from a first fit."""
+    first = link_torque(points, gravity)
+    offset = fit_points(points, first, with_sine_error).coefficients[3]
+    return link_torque(points, gravity, float(offset))
+
+
+def _subset(points: StaticPoints, rows: IntArray) -> StaticPoints:
+    return StaticPoints(
+        points.theta[rows], points.q[rows], points.direction[rows], points.position[rows], points.load[rows]
+    )

@@ -1,0 +1,84 @@
+"""Watch a policy: a window, or a video file."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from elastic_env.errors import ElasticError, ResultsExistError, missing_extra
+from train.evaluate import ENVIRONMENTS, Condition, make_policy
+
+_FRAMES_PER_S = 25
+
+
+def play(condition: Condition, console: Console, video: Path | None = None, max_s: float | None = None) -> None:
+    """Play one episode in a window in real time, or into a video file as fast as it goes.
+
+    Args:
+        condition: What to play.
+        console: Where messages go.
+        video: File to write (mp4 or gif); None opens a window.
+        max_s: Stop after this much simulated time [s].
+
+    Raises:
+        ResultsExistError: The video file exists.
+        MissingExtraError: The video writer is not installed.
+    """
+    env: Any = gymnasium.make(
+        ENVIRONMENTS[condition.env], render_mode="human" if video is None else "rgb_array",
+        reference=condition.reference, scenario=condition.scenario, **condition.env_options,
+    )  # fmt: skip
+    task = env.unwrapped.task
+    period = task.assumed_model.control_period_s
+    steps = task.num_steps if max_s is None else min(task.num_steps, round(max_s / period))
+    policy = make_policy(condition.policy, env)
+    try:
+        if video is None:
+            _window(env, policy, condition.seed, steps, period)
+        else:
+            _film(env, policy, condition.seed, steps, period, video, console)
+    finally:
+        env.close()
+
+
+def _episode(env: Any, policy: Any, seed: int, steps: int) -> Any:
+    """Play step by step; yields the number of each step."""
+    observation, _ = env.reset(seed=seed)
+    state, start = None, np.array(True)
+    for step in range(steps):
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        observation, _, terminated, truncated, info = env.step(action)
+        start = np.array(False)
+        yield step
+        if terminated:
+            raise ElasticError(f"the episode ended after {step + 1} control steps: {info['termination']}")
+        if truncated:
+            return
+
+
+def _window(env: Any, policy: Any, seed: int, steps: int, period: float) -> None:
+    begin = time.perf_counter()
+    for step in _episode(env, policy, seed, steps):
+        time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
+
+
+def _film(env: Any, policy: Any, seed: int, steps: int, period: float, video: Path, console: Console) -> None:
+    if video.exists():
+        raise ResultsExistError(f"{video} exists and is not overwritten; name another file")
+    if video.suffix not in {".mp4", ".gif"}:
+        raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")
+    try:
+        import imageio.v2 as imageio
+    except ImportError:
+        raise missing_extra("imageio", "report", "writing a video") from None
+    every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
+    video.parent.mkdir(parents=True, exist_ok=True)
+    with imageio.get_writer(video, fps=1.0 / (every * period)) as writer:
+        for step in track(_episode(env, policy, seed, steps), "filming", total=steps, console=console, transient=True):
+            if step % every == 0:
+                writer.append_data(env.render())
+    console.print(f"wrote {video}")

@@ -1,0 +1,130 @@
+"""Throughput of the vector environment against raw `mj_step` on the same model, as ratios of one interleaved run."""
+
+import json
+import os
+import statistics
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import elastic_env  # noqa: F401  registers the environments
+from elastic_env.signals import Array
+from train.evaluate import ENVIRONMENTS
+from train.runs import new_run
+
+
+@dataclass(frozen=True)
+class SpeedResult:
+    """Medians over the rounds of one interleaved run.
+
+    Attributes:
+        num_envs: Worlds of the vector environment.
+        threads: Threads of both contenders.
+        env_steps_per_s: Control steps per second of the vector environment, all worlds together.
+        raw_steps_per_s: The same of `mj_step` alone.
+        ratio: Median of the rounds' ratios.
+    """
+
+    num_envs: int
+    threads: int
+    env_steps_per_s: float
+    raw_steps_per_s: float
+    ratio: float
+
+
+def measure(num_envs: int, steps: int, rounds: int, threads: int = 0, **env_options: Any) -> SpeedResult:
+    """Time the vector environment and raw stepping in turn.
+
+    Raw stepping has one `MjData` per world, starts from the same states and plays the same servo inputs: on every
+    thread nothing but writing `ctrl` and one call of `mj_step` with all sub-steps of a control period.
+
+    Args:
+        num_envs: Worlds.
+        steps: Control steps per round.
+        rounds: Rounds; the medians are reported.
+        threads: Threads, 0 for all cores.
+        **env_options: Arguments of the environment.
+    """
+    threads = min(threads or os.cpu_count() or 1, num_envs)
+    env: Any = gymnasium.make_vec(
+        ENVIRONMENTS["testbed"], num_envs=num_envs, vectorization_mode="vector_entry_point", num_threads=threads,
+        **env_options,
+    )  # fmt: skip
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    simulation = env.unwrapped.simulation
+    raw = _RawWorlds(env.unwrapped.task, simulation, threads)
+    env_times, raw_times = [], []
+    for _ in range(rounds + 1):
+        controls = np.empty((steps, *simulation.ctrl.shape))
+        begin = time.perf_counter()
+        for step in range(steps):
+            env.step(action)
+            controls[step] = simulation.ctrl
+        env_times.append(time.perf_counter() - begin)
+        raw_times.append(raw.run(controls))
+    env_times, raw_times = env_times[1:], raw_times[1:]  # the first round warms up
+    work = num_envs * steps
+    return SpeedResult(
+        num_envs=num_envs,
+        threads=threads,
+        env_steps_per_s=work / statistics.median(env_times),
+        raw_steps_per_s=work / statistics.median(raw_times),
+        ratio=statistics.median(r / e for e, r in zip(env_times, raw_times, strict=True)),
+    )
+
+
+class _RawWorlds:
+    """`mj_step` and nothing else: one `MjData` per world, threads that share the worlds out."""
+
+    def __init__(self, task: Any, simulation: Any, threads: int) -> None:
+        self._model, self._substeps = task.model, task.num_substeps
+        worlds = []
+        for world in range(task.num_worlds):
+            data = mujoco.MjData(self._model)
+            data.qpos[:], data.qvel[:] = simulation.qpos[world], simulation.qvel[world]
+            data.act[:], data.ctrl[:] = simulation.act[world], simulation.ctrl[world]
+            worlds.append((world, data))
+        self._shares = [worlds[i::threads] for i in range(threads)]
+
+    def run(self, controls: Array) -> float:
+        """Time to play servo inputs, (steps, num_worlds, nu), in every world [s]."""
+        workers = [threading.Thread(target=self._play, args=(share, controls)) for share in self._shares]
+        begin = time.perf_counter()
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+        return time.perf_counter() - begin
+
+    def _play(self, share: list[tuple[int, mujoco.MjData]], controls: Array) -> None:
+        model, substeps = self._model, self._substeps
+        for world, data in share:
+            ctrl = data.ctrl
+            for command in controls[:, world]:
+                ctrl[:] = command
+                mujoco.mj_step(model, data, substeps)
+
+
+def report(results: list[SpeedResult], console: Console, output: Path | None = None) -> Path:
+    """Print the ratios and write them as JSON."""
+    table = Table(title="vector environment against raw mj_step, medians of one interleaved run")
+    for name in ("worlds", "threads", "env steps/s", "raw steps/s", "ratio"):
+        table.add_column(name, justify="right")
+    for r in results:
+        table.add_row(
+            str(r.num_envs), str(r.threads), f"{r.env_steps_per_s:,.0f}", f"{r.raw_steps_per_s:,.0f}", f"{r.ratio:.3f}"
+        )
+    console.print(table)
+    folder = new_run("speed", {"num_envs": [r.num_envs for r in results]}, None, output)
+    path = folder / "speed.json"
+    path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
+    return path
