@@ -1,8 +1,8 @@
 """Analytic compensators of joint elasticity, as policies.
 
-    import baselines
-    policy = baselines.make("input", env)
-    action, state = policy.predict(observation)
+import baselines
+policy = baselines.make("input", env)
+action, state = policy.predict(observation)
 """
 
 from baselines.compensators import DynamicCompensator, GravityCompensator

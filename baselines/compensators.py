@@ -106,9 +106,7 @@ class GravityCompensator:
 
     memory_width = 0
 
-    def __init__(
-        self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod = "pinocchio"
-    ) -> None:
+    def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod = "pinocchio") -> None:
         if output not in get_args(OutputMethod):
             raise unknown_name("output compensator", output, get_args(OutputMethod))
         self.stiffness = model.stiffness

@@ -6,8 +6,8 @@ encoder θ the regression is
 .. math:: \theta_i - q_i = \frac{1}{K} (\tau_i + F d_i) + \frac{b}{2}\,\mathrm{sign}(\tau_i + F d_i) + c
 
 with the gravity torque τ at the *link* angle, the direction of approach d = ±1 (friction F), the dead band b and an
-offset c between IMU and encoder. A plain line is biased: by −2 to −3 % with 1.75 mrad of backlash, by +4 % with τ taken at
-the encoder angle. With two known masses, c₁ sin q separates an IMU error of that shape from K.
+offset c between IMU and encoder. A plain line is biased: by −2 to −3 % with 1.75 mrad of backlash, by +4 % with τ taken
+at the encoder angle. With two known masses, c₁ sin q separates an IMU error of that shape from K.
 """
 
 from collections.abc import Sequence
@@ -176,7 +176,7 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
         (np.arange(len(positions)),), statistics, n_resamples=_RESAMPLES, vectorized=False, method="percentile",
         rng=np.random.default_rng(seed),
     ).confidence_interval  # fmt: skip
-    line = stats.linregress(torque, points.theta - points.q)
+    line: Any = stats.linregress(torque, points.theta - points.q)
     return Identification(
         stiffness_nm_per_rad=fit.stiffness,
         stiffness_low_nm_per_rad=float(interval.low[0]),

@@ -3,8 +3,8 @@
 Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to whatever a policy commands
 and shows it compensated encoder readings. The named policies are such compositions, see `make`.
 
-Policies take observations of one world, (m,), or of many, (num_worlds, m). Those with memory keep it in `state`, one row
-per world: pass the returned state back, and `episode_start` where episodes begin, as Stable-Baselines3 does.
+Policies take observations of one world, (m,), or of many, (num_worlds, m). Those with memory keep it in `state`, one
+row per world: pass the returned state back, and `episode_start` where episodes begin, as Stable-Baselines3 does.
 """
 
 from collections.abc import Callable
@@ -220,9 +220,7 @@ class _View:
         return standing & (rows[:, self._command] == rows[:, self._q]).all(axis=1)
 
 
-def _resume(
-    state: Any, episode_start: Any, rows: Array, view: _View, begin: Callable[[], Array]
-) -> tuple[Array, Any]:
+def _resume(state: Any, episode_start: Any, rows: Array, view: _View, begin: Callable[[], Array]) -> tuple[Array, Any]:
     """Memory and inner state for this call, with the rows of new episodes begun afresh."""
     if state is None:
         starts = view.is_start(rows) if episode_start is None else np.broadcast_to(episode_start, (len(rows),))
@@ -297,7 +295,7 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
-            'gymnasium.make("elastic_env/Testbed-v0") and pass it here, also when the policy will run on a wrapper of it'
+            'gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to run on a wrapper of it'
         )
     return POLICIES[name](env, PolicyOptions(**options))
 

@@ -1,7 +1,7 @@
 """Gymnasium environments of robots with elastic joints: a single-actuator testbed.
 
-    import gymnasium, elastic_env
-    env = gymnasium.make("elastic_env/Testbed-v0", scenario="nominal")
+import gymnasium, elastic_env
+env = gymnasium.make("elastic_env/Testbed-v0", scenario="nominal")
 """
 
 import gymnasium

@@ -17,7 +17,7 @@ from elastic_env.errors import ConfigurationError, unknown_name
 ModelT = TypeVar("ModelT", bound="Model")
 
 
-def quantity(unit: str, default: Any = ..., *, description: str, **bounds: float) -> Any:
+def quantity(unit: str, default: Any = ..., *, description: str, **bounds: Any) -> Any:
     """A physical parameter of a `Model`.
 
     Args:
@@ -61,8 +61,21 @@ def _explain_one(model: type[BaseModel], problem: Mapping[str, Any]) -> str:
     if problem["type"] == "value_error":
         message = str(problem["ctx"]["error"])
         return f"{name}: {message}" if name else message
-    requirement = problem["msg"].removeprefix("Input should be ")
+    requirement = _bounds(model, name) or problem["msg"].removeprefix("Input should be ")
     return f"{model.__name__}.{name} must be {requirement}{_unit(model, name)}, got {problem['input']!r}"
+
+
+def _bounds(model: type[BaseModel], name: str) -> str:
+    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one without."""
+    field = model.model_fields.get(name)
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    constraints = [
+        f"{sign} {getattr(constraint, key):.6g}"
+        for constraint in (field.metadata if field is not None else [])
+        for key, sign in signs.items()
+        if hasattr(constraint, key)
+    ]
+    return f"a finite number {' and '.join(constraints)}" if constraints else ""
 
 
 def _unit(model: type[BaseModel], name: str) -> str:

@@ -14,12 +14,11 @@ from collections.abc import Callable
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import model_validator
 
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ElasticError
-from elastic_env.signals import Array
+from elastic_env.signals import Array, Parameter
 
 TorqueFunction = Callable[[Array], Array]
 
@@ -27,7 +26,8 @@ TorqueFunction = Callable[[Array], Array]
 class Servo(Model):
     r"""Position servo on the rotor: PID on the motor encoder, limited in torque.
 
-    .. math:: \tau_m = \mathrm{clip}(k_p (u - \theta) - k_v \dot\theta + k_i \textstyle\int (u - \theta) dt, \pm \tau_{max})
+    .. math::
+        \tau_m = \mathrm{clip}(k_p (u - \theta) - k_v \dot\theta + k_i \textstyle\int (u - \theta) dt, \pm \tau_{max})
 
     A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like this PID. The
     integrator lets it hold its angle without steady-state error. Against wind-up it is clamped to what it can be
@@ -76,9 +76,9 @@ class ElasticJoint(Model):
 def joint_torque(
     deflection: Array,
     deflection_rate: Array,
-    stiffness: npt.ArrayLike,
-    damping: npt.ArrayLike = 0.0,
-    backlash: npt.ArrayLike = 0.0,
+    stiffness: Parameter,
+    damping: Parameter = 0.0,
+    backlash: Parameter = 0.0,
 ) -> Array:
     r"""Torque that the transmission passes from rotor to link [Spong1987], with a dead band.
 
@@ -99,7 +99,7 @@ def joint_torque(
     return stiffness * beyond + damping * deflection_rate
 
 
-def static_deflection(torque: Array, stiffness: npt.ArrayLike, backlash: npt.ArrayLike = 0.0) -> Array:
+def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter = 0.0) -> Array:
     r"""Deflection at rest under a joint torque, Eqs. 2 and 3: δ = K⁻¹ τ, plus half the dead band towards the load.
 
     Args:
@@ -115,7 +115,7 @@ def static_deflection(torque: Array, stiffness: npt.ArrayLike, backlash: npt.Arr
 
 def static_link_angle(
     theta: Array,
-    stiffness: npt.ArrayLike,
+    stiffness: Parameter,
     torque: TorqueFunction,
     torque_gradient: TorqueFunction,
     tolerance: float = 1e-12,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -25,8 +25,8 @@ from elastic_env.tasks.task import Task
 from elastic_env.tasks.testbed import TestbedConfig, TestbedTask
 from elastic_env.worlds import Transition, Worlds
 
-Observation = npt.NDArray[np.float64]
-Action = npt.NDArray[np.float32]
+Observation: TypeAlias = npt.NDArray[Any]
+Action: TypeAlias = npt.NDArray[Any]
 
 RENDER_MODES = ("rgb_array", "human")
 
@@ -65,18 +65,17 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         picture: Makes the picture of the task when it is first rendered.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}  # noqa: RUF012  Gymnasium's own form
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
 
-    def __init__(
-        self, task: Task, render_mode: str | None, picture: Callable[[], Picture]
-    ) -> None:
+    def __init__(self, task: Task, render_mode: str | None, picture: Callable[[], Picture]) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise unknown_name("render mode", render_mode, RENDER_MODES)
         self.render_mode = render_mode
         self.observation_space = task.observation_table.space(np.float64)
         self.action_space = task.action_table.space(np.float32)
         self._worlds = Worlds(task, num_threads=1)
-        self._make_picture, self._picture = picture, None
+        self._make_picture = picture
+        self._picture: Picture | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -182,8 +181,8 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
         self._begin(worlds)
         fresh = self._worlds.task.signals()
-        info = {key: np.where(worlds, fresh[key], value) if key in fresh else value for key, value in result.info.items()}
-        info["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
+        info = result.info | {key: np.where(worlds, value, result.info[key]) for key, value in fresh.items()}
+        info["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in result.info["reward_terms"].items()}
         info["termination"] = np.where(worlds, "", info["termination"])
         return Transition(
             self._worlds.task.observe(),
@@ -207,7 +206,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         return self._worlds.task.observe(), info
 
 
-def testbed_config(
+def configure_testbed(
     reference: str | dict[str, Any] | Hold | Sine | Multisine | Steps = "hold",
     scenario: str | Scenario = "nominal",
     stiffness: float | str | Path | None = None,
@@ -246,8 +245,8 @@ def testbed_config(
 
 
 def make_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
-    """Entry point of `elastic_env/Testbed-v0`; arguments as in `testbed_config`."""
-    config = testbed_config(**arguments)
+    """Entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
+    config = configure_testbed(**arguments)
     return ElasticEnv(TestbedTask(config, num_worlds=1), render_mode, lambda: TestbedPicture(config.pendulum))
 
 
@@ -258,12 +257,12 @@ def make_testbed_vector(
     render_mode: str | None = None,
     **arguments: Any,
 ) -> ElasticVectorEnv:
-    """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `testbed_config`."""
+    """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
     if render_mode is not None:
         raise ConfigurationError(f"the vector environment does not render, got render_mode {render_mode!r}; use None")
     if num_envs < 1:
         raise ConfigurationError(f"num_envs must be at least 1, got {num_envs}")
-    return ElasticVectorEnv(TestbedTask(testbed_config(**arguments), num_envs), num_threads, autoreset_mode)
+    return ElasticVectorEnv(TestbedTask(configure_testbed(**arguments), num_envs), num_threads, autoreset_mode)
 
 
 def _seeds(seed: int | list[int | None] | None, num_envs: int) -> list[int | None]:

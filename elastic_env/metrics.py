@@ -1,12 +1,12 @@
 """Scores of an episode from the samples of its steps: RMS, peak, range, mean. One row per world."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from elastic_env.signals import Array, BoolArray
+from elastic_env.signals import Array, BoolArray, Signals
 
 
 def rms(values: Array, axis: int = 0) -> Array:
@@ -46,7 +46,7 @@ class RunningStatistics:
         self._low[:, worlds], self._high[:, worlds] = np.inf, -np.inf
         self._count[worlds] = 0
 
-    def update(self, signals: Mapping[str, Array], sampled: BoolArray) -> None:
+    def update(self, signals: Signals, sampled: BoolArray) -> None:
         """Take one sample of every signal, (num_worlds,) each, in the worlds where `sampled` is true."""
         for name, row in self._row.items():
             values = signals[name]
@@ -86,7 +86,7 @@ class EpisodeMetrics:
         self._scored.restart(worlds)
         self._all.restart(worlds)
 
-    def update(self, signals: Mapping[str, Array], scored: BoolArray) -> None:
+    def update(self, signals: Signals, scored: BoolArray) -> None:
         """Take one step: the task's signals, (num_worlds,) each, and where they are scored."""
         self._scored.update(signals, scored)
         self._all.update(signals, self._every)

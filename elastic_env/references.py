@@ -6,7 +6,7 @@ polynomials, which start and end without acceleration.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -89,7 +89,9 @@ class Hold(Model):
 
     kind: Literal["hold"] = "hold"
     positions: int = quantity("1", 20, ge=2, description="number of static positions")
-    lower: float = quantity("1", -0.875, gt=-1, lt=1, description="first position, as a share of the torque at horizontal")
+    lower: float = quantity(
+        "1", -0.875, gt=-1, lt=1, description="first position, share of the torque at the horizontal"
+    )
     upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
     rate: float = quantity("rad/s", 0.06, gt=0, description="peak rate of the moves")
     sag: float = quantity("rad", 60 / 1001, ge=0, description="deflection at the horizontal without compensation")
@@ -269,9 +271,10 @@ class Steps(Model):
         return Plan(q, q_dot, q_ddot, scored=t > STAND_S, rest=np.full(len(t), -1))
 
 
-Reference = Annotated[Hold | Sine | Multisine | Steps, Field(discriminator="kind")]
+AnyReference: TypeAlias = Hold | Sine | Multisine | Steps
+Reference = Annotated[AnyReference, Field(discriminator="kind")]
 
-REFERENCES: dict[str, type[Hold] | type[Sine] | type[Multisine] | type[Steps]] = {
+REFERENCES: dict[str, type[AnyReference]] = {
     "hold": Hold,
     "sine": Sine,
     "multisine": Multisine,
@@ -279,13 +282,15 @@ REFERENCES: dict[str, type[Hold] | type[Sine] | type[Multisine] | type[Steps]] =
 }
 
 
-def make_reference(reference: "str | dict[str, Any] | Hold | Sine | Multisine | Steps") -> Hold | Sine | Multisine | Steps:
+def make_reference(
+    reference: "str | dict[str, Any] | AnyReference",
+) -> AnyReference:
     """A reference from its name, from a mapping with `kind` and parameters, or as it is.
 
     Raises:
         ConfigurationError: The kind does not exist, or a parameter does not fit it.
     """
-    if isinstance(reference, Hold | Sine | Multisine | Steps):
+    if isinstance(reference, AnyReference):
         return reference
     if isinstance(reference, str):
         reference = {"kind": reference}

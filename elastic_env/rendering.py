@@ -4,7 +4,6 @@ What is drawn at angle x stands at q_ref + factor · (x − q_ref); the factor i
 pendulum is the reference, the solid one the link, the blue pointer the rotor.
 """
 
-from collections.abc import Mapping
 from typing import Any, Protocol
 
 import mujoco
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from elastic_env.robots.testbed import Pendulum
-from elastic_env.signals import Array
+from elastic_env.signals import Signals
 
 EXAGGERATION = 8.0
 """Factor by which deviations from the reference are enlarged."""
@@ -30,11 +29,11 @@ _BACKGROUND = (0.96, 0.97, 0.98)
 class Picture(Protocol):
     """Draws the present state of a task from its signals."""
 
-    def rgb(self, signals: Mapping[str, Array]) -> npt.NDArray[np.uint8]:
+    def rgb(self, signals: Signals) -> npt.NDArray[np.uint8]:
         """An image, (height, width, 3)."""
         ...
 
-    def show(self, signals: Mapping[str, Array]) -> None:
+    def show(self, signals: Signals) -> None:
         """Update the window."""
         ...
 
@@ -56,10 +55,10 @@ class TestbedPicture:
     def __init__(self, pendulum: Pendulum) -> None:
         self._model = _display_spec(pendulum).compile()
         self._data = mujoco.MjData(self._model)
-        self._renderer: mujoco.Renderer | None = None
+        self._renderer: Any = None
         self._viewer: Any = None
 
-    def rgb(self, signals: Mapping[str, Array]) -> npt.NDArray[np.uint8]:
+    def rgb(self, signals: Signals) -> npt.NDArray[np.uint8]:
         """See `Picture`."""
         self._pose(signals)
         if self._renderer is None:
@@ -67,7 +66,7 @@ class TestbedPicture:
         self._renderer.update_scene(self._data, camera="front")
         return _with_caption(self._renderer.render().copy(), _caption(signals))
 
-    def show(self, signals: Mapping[str, Array]) -> None:
+    def show(self, signals: Signals) -> None:
         """See `Picture`."""
         self._pose(signals)
         if self._viewer is None:
@@ -88,7 +87,7 @@ class TestbedPicture:
             self._viewer.close()
         self._renderer = self._viewer = None
 
-    def _pose(self, signals: Mapping[str, Array]) -> None:
+    def _pose(self, signals: Signals) -> None:
         reference, link = float(signals["reference_angle"][0]), float(signals["link_angle"][0])
         rotor = link + float(signals["deflection"][0])
         self._data.joint("reference").qpos = reference
@@ -97,7 +96,7 @@ class TestbedPicture:
         mujoco.mj_forward(self._model, self._data)
 
 
-def _caption(signals: Mapping[str, Array]) -> list[str]:
+def _caption(signals: Signals) -> list[str]:
     return [
         f"t = {float(signals['time_s'][0]):6.2f} s     deviations from the reference drawn x {EXAGGERATION:g}",
         f"deflection {1e3 * float(signals['deflection'][0]):+7.2f} mrad     "

@@ -1,7 +1,7 @@
 """Rigid-body dynamics by Pinocchio, the independent reference for everything that MuJoCo or NumPy compute of a model.
 
-The only file that imports pinocchio. Kinematic tree and inertias are taken from a compiled MuJoCo model in full precision
-(its XML output has six digits); the algorithms are Pinocchio's.
+The only file that imports pinocchio. Kinematic tree and inertias are taken from a compiled MuJoCo model in full
+precision (its XML output has six digits); the algorithms are Pinocchio's.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,9 +53,7 @@ class RigidBody:
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (..., n) [N·m]."""
-        return self._rows(
-            lambda *rows: pinocchio.rnea(self._model, self._data, *rows), q - self._zero, q_dot, q_ddot
-        )
+        return self._rows(lambda *rows: pinocchio.rnea(self._model, self._data, *rows), q - self._zero, q_dot, q_ddot)
 
     def _rows(self, function: Callable[..., Array], *arrays: Array) -> Array:
         n = arrays[0].shape[-1]

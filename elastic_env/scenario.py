@@ -18,7 +18,7 @@ class Scenario(Model):
     stiffness_scale: float = quantity("1", 1.0, gt=0, description="true over assumed stiffness of every joint")
     friction_scale: float = quantity("1", 1.0, ge=0, description="share of the joints' friction that acts, 0 for none")
     backlash_rad: float = quantity("rad", 0.0, ge=0, description="dead band of every joint, unknown to the compensator")
-    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="true over assumed mass of the testbed's pendulum")
+    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="true over assumed mass of the pendulum")
     encoder_counts: bool = True
     """Whether the encoders have whole counts."""
     encoder_bias_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the encoders' homing error")

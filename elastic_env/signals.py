@@ -2,13 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-Array: TypeAlias = npt.NDArray[np.float64]
+Array: TypeAlias = npt.NDArray[np.floating[Any]]
+"""Real numbers, float64 throughout."""
+Signals: TypeAlias = dict[str, npt.NDArray[Any]]
+"""Named values of one step, one row per world."""
+Parameter: TypeAlias = Array | float
+"""A parameter that is broadcast against an array: one number, or one per joint."""
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 
@@ -48,11 +53,11 @@ class SignalTable:
             return slice(indices[0], indices[0] + len(indices))
         return indices
 
-    def space(self, dtype: npt.DTypeLike) -> spaces.Box:
+    def space(self, dtype: type[np.float32] | type[np.float64]) -> Any:
         """The Gymnasium space of one world."""
         low = np.array([signal.low for signal in self.signals])
         high = np.array([signal.high for signal in self.signals])
-        return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)  # pyright: ignore[reportArgumentType]
+        return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
     def markdown(self) -> str:
         """The table as a reader wants it: column, name, unit, meaning."""

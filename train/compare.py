@@ -59,7 +59,9 @@ class CompareConfig(Model):
     @field_validator("policies", mode="before")
     @classmethod
     def _names_are_policies(cls, value: Any) -> Any:
-        return [{"name": item} if isinstance(item, str) else item for item in value] if isinstance(value, list) else value
+        return (
+            [{"name": item} if isinstance(item, str) else item for item in value] if isinstance(value, list) else value
+        )
 
     def conditions(self) -> list[Condition]:
         """All cells, in the order reference, scenario, policy."""
@@ -169,7 +171,9 @@ def _try_out(condition: Condition) -> None:
     env = make_vector_env(condition, 1)
     policy = make_policy(condition.policy, env)
     if not hasattr(policy, "predict"):
-        raise ConfigurationError(f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}")
+        raise ConfigurationError(
+            f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
+        )
 
 
 def _evaluate_in_process(condition: Condition, steps: "queue.Queue[int]") -> Evaluation:

@@ -65,5 +65,3 @@ def _paper_table(result: identification.Identification, static: list[Evaluation]
         name = evaluation.condition.policy.title
         table.add_row(f"link error at rest, {name} [mrad]", f"{error.min():+.1f} to {error.max():+.1f}", paper)
     return table
-
-

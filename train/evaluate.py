@@ -1,4 +1,4 @@
-"""Run a policy in an environment, many episodes at once, and keep its metrics, one time series, and the static points."""
+"""Run a policy in an environment, many episodes at once; keep its metrics, one time series, and the static points."""
 
 import importlib
 from collections.abc import Callable

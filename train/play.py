@@ -77,6 +77,7 @@ def _film(env: Any, policy: Any, seed: int, steps: int, period: float, video: Pa
         raise missing_extra("imageio", "report", "writing a video") from None
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     video.parent.mkdir(parents=True, exist_ok=True)
+    writer: Any
     with imageio.get_writer(video, fps=1.0 / (every * period)) as writer:
         for step in track(_episode(env, policy, seed, steps), "filming", total=steps, console=console, transient=True):
             if step % every == 0:

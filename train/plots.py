@@ -81,7 +81,14 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
             residual = residual + result.imu_sine_error_rad * np.sin(points.q[chosen])
         bottom.scatter(torque[chosen], _MRAD * residual, zorder=3, **style)
     plain = line / result.line_stiffness_nm_per_rad + np.mean(deflection - torque / result.line_stiffness_nm_per_rad)
-    top.plot(line, _MRAD * plain, color="#888888", lw=1.0, ls=":", label=f"plain line, {_k(result.line_stiffness_nm_per_rad)}")
+    top.plot(
+        line,
+        _MRAD * plain,
+        color="#888888",
+        lw=1.0,
+        ls=":",
+        label=f"plain line, {_k(result.line_stiffness_nm_per_rad)}",
+    )
     top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}")
     top.text(
         0.03, 0.95,
@@ -120,7 +127,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     axis.set_title(f"Link error at rest, scenario {evaluations[0].condition.scenario}")
     axis.set_xlabel("gravity torque at the link angle [N·m]")
     axis.set_ylabel("q_ref − q by the link's IMU [mrad]")
-    axis.legend(loc="upper left", fontsize=9)
+    axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=9)
     return _save(plt, figure, path)
 
 
@@ -177,8 +184,12 @@ def draw_overview(evaluations: Sequence[Evaluation], metric: str, path: Path) ->
         axis.set_xticks(range(len(scenarios)), scenarios, rotation=25, ha="right")
         axis.grid(axis="x", visible=False)
     axes[0][0].set_ylabel(f"{metric.removesuffix('_rad').replace('_', ' ')} [mrad]")
-    handles = {label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), ncols=len(policies), loc="lower center", bbox_to_anchor=(0.5, -0.06))
+    handles = {
+        label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        handles.values(), handles.keys(), ncols=len(policies), loc="lower center", bbox_to_anchor=(0.5, -0.06)
+    )
     return _save(plt, figure, path)
 
 

@@ -54,8 +54,8 @@ def _empty(folder: Path) -> Path:
         raise ResultsExistError(f"{folder} is a file; name a folder that is new or empty")
     if _holds_results(folder):
         raise ResultsExistError(
-            f"{folder} already holds results ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), which are "
-            "never overwritten; name another folder, or leave --output out"
+            f"{folder} already holds results ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), "
+            "which are never overwritten; name another folder, or leave --output out"
         )
     return folder
 

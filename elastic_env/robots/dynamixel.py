@@ -5,12 +5,12 @@
 | K | 1001 N·m/rad | the paper, section IV-B |
 | B | 0.839 kg·m² | 33.3 g·cm² (maxon EC-4pole 30) × 501.923²; gear inertia unknown, not included |
 | friction | 5.4 N·m | derived from the paper's r = 0.9775 and Fig. 6; published losses give about 6 N·m for the gear |
-| backlash | below 1.75 mrad | ROBOTIS e-manual, H54-200-S500-R: 6 arcmin; 0 by default, the bound in scenario `backlash` |
+| backlash | below 1.75 mrad | ROBOTIS e-manual: 6 arcmin; 0 by default, the bound in scenario `backlash` |
 | encoder | 501,923 counts/turn | ROBOTIS e-manual; 1000 per motor turn, so it sits on the motor side |
-| torque | 84 N·m | current limit of 1240 counts = 20 A (THORMANG3 leg servos) on the measured line 4.338 N·m/A − 2.694 N·m |
+| torque | 84 N·m | current limit 1240 counts = 20 A (THORMANG3 legs) on the measured line 4.338 N·m/A − 2.694 N·m |
 | speed | 3.47 rad/s | ROBOTIS e-manual: 33.1 rpm without load |
 | D | 10 N·m·s/rad | our assumption: not published; `docs/testbed.md` shows the sensitivity from 5 to 50 |
-| servo | 18000, 250 | position gain and upper joint damping of the DYROS-JET MuJoCo model; scaling of the real gains unpublished |
+| servo | 18000, 250 | position gain and upper joint damping of the DYROS-JET MuJoCo model; real scaling unpublished |
 | integrator | 0.1 s | our assumption: the real cascade has one, its time constant is not published |
 """
 

@@ -279,9 +279,7 @@ def _take_keyframes(spec: mujoco.MjSpec) -> _Keyframes | None:
     if not spec.keys:
         return None
     model = spec.compile()
-    keyframes = _Keyframes(
-        model, sorted(spec.joints, key=lambda j: j.id), sorted(spec.actuators, key=lambda a: a.id)
-    )
+    keyframes = _Keyframes(model, sorted(spec.joints, key=lambda j: j.id), sorted(spec.actuators, key=lambda a: a.id))
     for key in list(spec.keys):
         spec.delete(key)
     return keyframes
@@ -314,9 +312,7 @@ def _give_keyframes(spec: mujoco.MjSpec, keyframes: _Keyframes | None, joints: l
         )  # fmt: skip
 
 
-def _start_undeflected(
-    model: mujoco.MjModel, name: str, qpos: Array, qvel: Array, ctrl: Array, series: bool
-) -> None:
+def _start_undeflected(model: mujoco.MjModel, name: str, qpos: Array, qvel: Array, ctrl: Array, series: bool) -> None:
     """θ = q, θ̇ = q̇ and the servo's command at the link angle, in one keyframe's vectors."""
     at = JointAddresses.of(model, [name])
     qpos[at.theta], qvel[at.theta_dot] = qpos[at.q], qvel[at.q_dot]

@@ -105,10 +105,12 @@ def read_stiffness(value: float | str | Path) -> float:
         return float(value)
     path = Path(value)
     if not path.is_file():
-        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, found no file {path}")
+        raise ConfigurationError(
+            f"stiffness must be a number [N·m/rad] or an identification file, found no file {path}"
+        )
     try:
         return float(json.loads(path.read_text())[STIFFNESS_KEY])
     except (json.JSONDecodeError, KeyError, TypeError, ValueError):
         raise ConfigurationError(
-            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, as `elastic identify` writes"
+            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see `elastic identify`"
         ) from None

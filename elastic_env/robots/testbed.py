@@ -2,8 +2,8 @@ r"""The paper's single-joint testbed (Fig. 4): a servo module, a linkage with a 
 
 The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that holds it is
 τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length: the range of its static deflection
-(−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, for which 60 N·m leave room; a steel bob of 10 kg, 0.61 m from
-the axis, with a radius of gyration of 0.1 m, is our choice.
+(−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, for which 60 N·m leave room; a steel bob of 10 kg, 0.61 m
+from the axis, with a radius of gyration of 0.1 m, is our choice.
 """
 
 import mujoco

@@ -1,6 +1,6 @@
 """What a task is: the rules of one environment on (num_worlds, ...) arrays, without any loop over worlds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import mujoco
@@ -8,14 +8,14 @@ import numpy as np
 
 from elastic_env.metrics import Metric
 from elastic_env.robots.robot_model import RobotModel
-from elastic_env.signals import Array, BoolArray, SignalTable
+from elastic_env.signals import Array, BoolArray, Signals, SignalTable
 from elastic_env.simulation import Simulation
 
 
 class Task(Protocol):
-    """Rules of an environment. `elastic_env.worlds.Worlds` drives it, in this order, every control step:
+    """Rules of an environment, driven by `elastic_env.worlds.Worlds` in this order every control step.
 
-    command → (physics) → sense → signals, reward_terms, scored, finished, failed → observe
+    command → (physics) → sense → signals, scored, reward_terms, failures, finished → observe
     """
 
     model: mujoco.MjModel
@@ -47,11 +47,11 @@ class Task(Protocol):
         """A fresh observation, (num_worlds, len(observation_table))."""
         ...
 
-    def signals(self) -> dict[str, Array]:
+    def signals(self) -> Signals:
         """Truth and scores of this step by name, (num_worlds,) each."""
         ...
 
-    def reward_terms(self, signals: Mapping[str, Array], diverged: BoolArray) -> dict[str, Array]:
+    def reward_terms(self, signals: Signals, diverged: BoolArray) -> dict[str, Array]:
         """Weighted terms whose sum is the reward, (num_worlds,) each."""
         ...
 

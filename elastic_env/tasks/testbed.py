@@ -15,7 +15,7 @@ Observation of one world (float64):
 Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], within ±0.3.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,15 +31,13 @@ from elastic_env.robots.robot_model import RobotModel
 from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec, rigid_spec
 from elastic_env.scenario import Scenario, make_scenario
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
-from elastic_env.signals import Array, BoolArray, Signal, SignalTable
+from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
 from elastic_env.simulation import Simulation
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
 
-ACTION = SignalTable(
-    (Signal("command_offset", "rad", "θ_cmd − q_ref", low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD),)
-)
+ACTION = SignalTable((Signal("command_offset", "rad", "θ_cmd − q_ref", low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD),))
 
 OBSERVATION = SignalTable(
     (
@@ -146,7 +144,7 @@ class TestbedTask:
     __test__ = False
 
     action_table = ACTION
-    metrics = METRICS
+    metrics: Sequence[Metric] = METRICS
 
     def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
         _require_feasible(config)
@@ -156,9 +154,7 @@ class TestbedTask:
         self.observation_table = SignalTable((*OBSERVATION, LINK_IMU)) if config.observe_link else OBSERVATION
         self.assumed_model = config.robot_model(config.joint, config.pendulum)
         self._true_model = config.robot_model(config.true_joint, config.true_pendulum)
-        self.model = elastic_spec(
-            config.true_pendulum, config.true_joint, config.form, config.timestep_s
-        ).compile()
+        self.model = elastic_spec(config.true_pendulum, config.true_joint, config.form, config.timestep_s).compile()
         self._at = JointAddresses.of(self.model, [JOINT])
         self._noise = NoiseStream(num_worlds, width=1)
         self._reference = _ReferenceRows(config, num_worlds)
@@ -177,12 +173,12 @@ class TestbedTask:
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place the testbed at rest under zero offset: the servo holds q_ref, the spring is already deflected."""
         scenario = self.config.scenario
-        for world in np.flatnonzero(worlds):
+        for world in np.flatnonzero(worlds).tolist():
             generator = generators[world]
-            self._reference.draw(int(world), generator)
+            self._reference.draw(world, generator)
             self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0)
             self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
-            self._noise.restart(int(world), np.random.default_rng(generator.integers(2**63)))
+            self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
         self._step[worlds] = 0
         self._offset[worlds] = self._offset_before[worlds] = 0.0
         self._command[worlds] = self._reference.at(self._step).q[worlds]
@@ -220,7 +216,7 @@ class TestbedTask:
             columns.append(self._shown_imu)
         return np.stack(columns, axis=-1)
 
-    def signals(self) -> dict[str, Array]:
+    def signals(self) -> Signals:
         """Truth and scores of this step, (num_worlds,) each."""
         reference = self._reference.at(self._step)
         truth = self.truth()
@@ -238,7 +234,7 @@ class TestbedTask:
             "rest": reference.rest,
         }
 
-    def reward_terms(self, signals: Mapping[str, Array], diverged: BoolArray) -> dict[str, Array]:
+    def reward_terms(self, signals: Signals, diverged: BoolArray) -> dict[str, Array]:
         """Weighted penalties for link error, restless commands and divergence."""
         weights = self.config.reward
         return {
@@ -301,7 +297,7 @@ class _ReferenceRow:
     q_dot: Array
     q_ddot: Array
     scored: BoolArray
-    rest: Array
+    rest: IntArray
 
 
 class _ReferenceRows:
@@ -323,7 +319,7 @@ class _ReferenceRows:
             plan = self._reference.plan(generator, self._period)
             self._motion[world] = np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1)
 
-    def at(self, step: Array) -> _ReferenceRow:
+    def at(self, step: IntArray) -> _ReferenceRow:
         """Rows of the given steps, (num_worlds,); beyond the end the last row."""
         row = np.minimum(step, self.num_steps)
         motion = self._motion[self._row, row]
@@ -341,7 +337,8 @@ def _num_substeps(config: TestbedConfig) -> int:
     ratio = config.control_period_s / config.timestep_s
     if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
         raise ConfigurationError(
-            f"control_period_s must be a multiple of timestep_s, got {config.control_period_s} s and {config.timestep_s} s"
+            "control_period_s must be a multiple of timestep_s, "
+            f"got {config.control_period_s} s and {config.timestep_s} s"
         )
     return round(ratio)
 
