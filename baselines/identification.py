@@ -10,7 +10,7 @@ offset c between IMU and encoder. A plain line is biased: by −2 to −3 % with
 at the encoder angle. With two known masses, c₁ sin q separates an IMU error of that shape from K.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ HYSTERESIS_RESOLUTION_RAD = 1e-4
 """Differences between the directions of approach below this are not called hysteresis [rad]."""
 
 _SIGN_ITERATIONS = 5
+_PROGRESS_STEPS = 250
 _RESAMPLES = 999
 
 
@@ -201,18 +202,19 @@ class HoldRecorder:
     """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations and infos alone.
 
     Args:
-        visits: Directions of approach of the windows, as `Hold.visits` has them.
+        directions: Directions of approach of the windows, (visits,), as `Hold.visits` has them.
+        num_worlds: Worlds that play the reference in step.
     """
 
-    def __init__(self, visits: IntArray) -> None:
-        self._directions = visits
-        self._sums = np.zeros((len(visits), 2))
-        self._counts = np.zeros(len(visits), dtype=np.int64)
+    def __init__(self, directions: IntArray, num_worlds: int = 1) -> None:
+        self._directions = directions
+        self._sums = np.zeros((len(directions), num_worlds, 2))
+        self._counts = np.zeros(len(directions), dtype=np.int64)
 
-    def take(self, encoder: float, imu: float, rest: int) -> None:
-        """One control step: encoder [rad], IMU [rad], and the number of the window, -1 outside."""
+    def take(self, encoder: Array, imu: Array, rest: int) -> None:
+        """One control step: encoder and IMU, (num_worlds,) [rad], and the number of the window, -1 outside."""
         if rest >= 0:
-            self._sums[rest] += encoder, imu
+            self._sums[rest] += np.stack([encoder, imu], axis=-1)
             self._counts[rest] += 1
 
     @property
@@ -220,70 +222,82 @@ class HoldRecorder:
         """Whether every window has been visited."""
         return bool(self._counts.all())
 
-    def points(self) -> StaticPoints:
-        """The averages.
+    def points(self) -> list[StaticPoints]:
+        """The averages of every world.
 
         Raises:
             ElasticError: A window has no sample: the run ended early.
         """
         if not self.is_complete:
             raise ElasticError(f"the run ended before all {len(self._counts)} static positions were visited")
-        theta, q = (self._sums / self._counts[:, None]).T
+        means = self._sums / self._counts[:, None, None]
         half = len(self._directions) // 2
         position = np.concatenate([np.arange(half), np.arange(half)[::-1]])
-        return StaticPoints(theta, q, self._directions, position, np.zeros(len(theta), dtype=np.int64))
+        load = np.zeros(len(position), dtype=np.int64)
+        return [
+            StaticPoints(means[:, world, 0], means[:, world, 1], self._directions, position, load)
+            for world in range(means.shape[1])
+        ]
 
 
-def record_points(env: Any, seed: int | None = None, progress: Any = None) -> StaticPoints:
-    """Drive a scalar testbed, simulated or real, through its `hold` reference without compensation.
+def record_points(
+    env: Any, seed: int | None = None, progress: Callable[[float], None] | None = None
+) -> list[StaticPoints]:
+    """Drive a testbed, simulated or real, through its `hold` reference without compensation.
 
     Args:
-        env: Testbed environment with reference "hold".
-        seed: Seed of the episode.
-        progress: Called with the share of the episode that is done, after every step.
+        env: Testbed environment with reference "hold", scalar or vector.
+        seed: Seed of the episode, of the first world's in a vector environment.
+        progress: Called with the share of the episode that is done, now and then.
+
+    Returns:
+        The static points of every world; one entry for a scalar environment.
 
     Raises:
         ConfigurationError: The environment's reference has no static positions.
         ElasticError: The episode ended early.
     """
-    reference = env.unwrapped.task.config.reference
-    if not hasattr(reference, "visits"):
-        raise ConfigurationError(f"identification needs the reference 'hold', the environment has {reference.kind!r}")
-    recorder = HoldRecorder(reference.visits[1])
-    encoder = env.unwrapped.task.observation_table.names.index("encoder_angle")
+    task = env.unwrapped.task
+    if not hasattr(task.config.reference, "visits"):
+        raise ConfigurationError(
+            f"identification needs the reference 'hold', the environment has {task.config.reference.kind!r}"
+        )
+    recorder = HoldRecorder(task.config.reference.visits[1], task.num_worlds)
+    encoder = task.observation_table.names.index("encoder_angle")
     zero = np.zeros(env.action_space.shape, dtype=np.float32)
     env.reset(seed=seed)
-    total = env.unwrapped.task.num_steps
-    for step in range(total):
-        observation, _, terminated, truncated, info = env.step(zero)
-        recorder.take(observation[encoder], info["link_angle_imu"], info["rest"])
-        if progress is not None:
-            progress((step + 1) / total)
-        if terminated or truncated:
+    for step in range(task.num_steps):
+        observation, _, terminated, _, info = env.step(zero)
+        recorder.take(observation[..., encoder], info["link_angle_imu"], int(np.max(info["rest"])))
+        if progress is not None and (step + 1) % _PROGRESS_STEPS == 0:
+            progress((step + 1) / task.num_steps)
+        if np.any(terminated):
             break
     return recorder.points()
 
 
-def identify(envs: Sequence[Any], seed: int | None = None, progress: Any = None) -> tuple[Identification, StaticPoints]:
-    """Identify the joint of one testbed environment, or of two that differ in a known mass.
+def identify(
+    envs: Sequence[Any], seed: int | None = None, progress: Callable[[float], None] | None = None
+) -> tuple[list[Identification], list[StaticPoints]]:
+    """Identify the joint of a testbed environment, or of two that differ in a known mass.
 
     Args:
-        envs: One or two scalar testbeds with reference "hold".
-        seed: Seed of the episodes and of the resampling.
+        envs: One or two testbeds with reference "hold", scalar or vector.
+        seed: Seed of the episodes, of the first world's in a vector environment, and of the resampling.
         progress: Called with the share of the work that is done.
 
     Returns:
-        The result, and the points that it is made of.
+        Result and points of every world; one entry each for scalar environments.
     """
     if len(envs) not in {1, 2}:
         raise ConfigurationError(f"identification takes one environment or two with different masses, got {len(envs)}")
     parts = []
     for number, env in enumerate(envs):
-        part = None if progress is None else (lambda share, n=number: progress((n + share) / len(envs)))
-        parts.append(record_points(env, seed, part))
-    points = StaticPoints.joined(parts)
+        share = None if progress is None else (lambda done, n=number: progress((n + done) / len(envs)))
+        parts.append(record_points(env, seed, share))
     gravity = [make_gravity(env.unwrapped.assumed_model) for env in envs]
-    return identify_points(points, gravity, seed=seed or 0), points
+    points = [StaticPoints.joined(world) for world in zip(*parts, strict=True)]
+    return [identify_points(world, gravity, seed=seed or 0) for world in points], points
 
 
 def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], offset: float = 0.0) -> Array:

@@ -20,7 +20,7 @@ EXAGGERATION = 8.0
 _WIDTH, _HEIGHT = 640, 480
 _REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
 _LINK_RGBA = (0.85, 0.45, 0.15, 1.0)
-_STEEL_RGBA = (0.55, 0.57, 0.6, 1.0)
+_STEEL_RGBA = (0.42, 0.44, 0.48, 1.0)
 _HOUSING_RGBA = (0.2, 0.22, 0.26, 1.0)
 _ROTOR_RGBA = (0.15, 0.4, 0.85, 1.0)
 _BACKGROUND = (0.96, 0.97, 0.98)
@@ -123,7 +123,8 @@ def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.visual.global_.offwidth, spec.visual.global_.offheight = _WIDTH, _HEIGHT
-    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.45] * 3, [0.5] * 3
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.15] * 3
+    spec.visual.headlight.specular = [0.0] * 3
     spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
         rgb1=_BACKGROUND, rgb2=_BACKGROUND, width=64, height=64,
@@ -131,10 +132,12 @@ def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
     reach = pendulum.com_distance
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     world = spec.worldbody
-    world.add_light(pos=[0.3, -2.0, 2.0], dir=[-0.1, 0.8, -0.8], castshadow=False)
-    world.add_camera(name="front", pos=[0.0, -2.9 * reach, -0.18 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50)
+    world.add_light(
+        pos=[0.3, -2.0, 2.0], dir=[-0.1, 0.8, -0.8], castshadow=False, diffuse=[0.45] * 3, specular=[0.1] * 3
+    )
+    world.add_camera(name="front", pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50)
     world.add_geom(name="housing", type=box, size=[0.07, 0.06, 0.09], pos=[0, 0.12, 0.02], rgba=_HOUSING_RGBA)
-    world.add_geom(name="stand", type=box, size=[0.03, 0.03, 0.6], pos=[0, 0.2, -0.5], rgba=(0.75, 0.77, 0.8, 1))
+    world.add_geom(name="stand", type=box, size=[0.03, 0.03, 0.6], pos=[0, 0.2, -0.5], rgba=(0.72, 0.74, 0.77, 1))
     for name, y, rod, bob in (
         ("reference", 0.03, _REFERENCE_RGBA, _REFERENCE_RGBA),
         ("link", 0.0, _STEEL_RGBA, _LINK_RGBA),

@@ -38,6 +38,8 @@ class Identify:
     """Number of static positions."""
     seed: int = 0
     """Seed of the sensor noise."""
+    repeats: int = 1
+    """Repeat with so many seeds and say how often the interval holds the true stiffness."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/identify, numbered if taken."""
 
@@ -48,24 +50,30 @@ class Identify:
         from train import plots
         from train.runs import new_run
 
+        if self.repeats < 1:
+            raise ConfigurationError(f"repeats must be at least 1, got {self.repeats}")
         plots.require_matplotlib()
         pendulums = [Pendulum()]
         if self.second_mass is not None:
             pendulums.append(Pendulum().with_mass_scaled(self.second_mass))
         envs: list[Any] = [
-            gymnasium.make(
-                "elastic_env/Testbed-v0", reference={"kind": "hold", "positions": self.positions},
-                scenario=self.scenario, stiffness=self.stiffness, pendulum=pendulum,
+            gymnasium.make_vec(
+                "elastic_env/Testbed-v0", num_envs=self.repeats, vectorization_mode="vector_entry_point",
+                reference={"kind": "hold", "positions": self.positions}, scenario=self.scenario,
+                stiffness=self.stiffness, pendulum=pendulum,
             )
             for pendulum in pendulums
         ]  # fmt: skip
         folder = new_run("identify", _settings(self), self.seed, self.output)
         with _bar("visiting static positions") as (bar, task):
-            result, points = identify(envs, self.seed, lambda share: bar.update(task, completed=share))
-        result.save(folder / "identification.json")
+            results, points = identify(envs, self.seed, lambda share: bar.update(task, completed=share))
+        results[0].save(folder / "identification.json")
         models = [env.unwrapped.assumed_model for env in envs]
-        figure = plots.draw_identification(result, points, models, folder / "identification.png")
-        _print_identification(result)
+        figure = plots.draw_identification(results[0], points[0], models, folder / "identification.png")
+        _print_identification(results[0])
+        if self.repeats > 1:
+            truth = float(envs[0].unwrapped.truth().model.stiffness[0])
+            _print_repeats(results, truth, self.seed, folder / "repeats.csv")
         _CONSOLE.print(f"wrote {folder / 'identification.json'} and {figure}", soft_wrap=True)
 
 
@@ -294,3 +302,26 @@ def _print_identification(result: Any) -> None:
     for name, value in rows:
         table.add_row(name, value)
     _CONSOLE.print(table)
+
+
+def _print_repeats(results: list[Any], truth: float, seed: int, path: Path) -> None:
+    """Spread over the seeds and coverage of the intervals, and one row per seed in a file."""
+    import csv
+
+    import numpy as np
+
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["seed", *results[0].model_dump()])
+        writer.writeheader()
+        writer.writerows({"seed": seed + i, **result.model_dump()} for i, result in enumerate(results))
+    stiffness = np.array([result.stiffness_nm_per_rad for result in results])
+    covered = sum(r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results)
+    widest = max(result.half_width for result in results)
+    _CONSOLE.print(
+        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to {stiffness.max():.1f} "
+        f"N·m/rad (true {truth:g}); friction median {np.median([r.friction_nm for r in results]):.2f} N·m; "
+        f"r median {np.median([r.pearson_r for r in results]):.4f}; plain line median "
+        f"{np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\n"
+        f"the 95 % interval holds the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
+    )
+    _CONSOLE.print(f"wrote {path}", soft_wrap=True)

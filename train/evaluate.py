@@ -235,10 +235,10 @@ class _FirstWorld:
     def take(self, observation: Array, info: dict[str, Any]) -> None:
         self._rows.append(tuple(float(info[name][0]) for name in TRACED))
         if self._recorder is not None:
-            self._recorder.take(observation[0, self._encoder], info["link_angle_imu"][0], int(info["rest"][0]))
+            self._recorder.take(observation[:1, self._encoder], info["link_angle_imu"][:1], int(info["rest"][0]))
 
     def trace(self) -> dict[str, Array]:
         return dict(zip(TRACED, np.array(self._rows).T, strict=True))
 
     def points(self) -> StaticPoints | None:
-        return self._recorder.points() if self._recorder is not None and self._recorder.is_complete else None
+        return self._recorder.points()[0] if self._recorder is not None and self._recorder.is_complete else None
