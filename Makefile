@@ -6,19 +6,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-# Pictures without a display: MuJoCo draws through EGL, on Linux the library libEGL of Mesa or of the GPU's driver.
-ifeq ($(shell uname -s),Linux)
-MUJOCO_GL ?= egl
-export MUJOCO_GL
-endif
-
-define NO_GL
-Warning: MuJoCo cannot draw with MUJOCO_GL="$(MUJOCO_GL)"; without libEGL, "egl" fails at import already. On Debian or Ubuntu:
-    apt-get install libegl1 libgl1-mesa-dri
-To compute without pictures, set MUJOCO_GL=disable.
-endef
-export NO_GL
-
 define WRONG_PYTHON
 elastic-env needs Python 3.11, 3.12 or 3.13, and "$(PYTHON)" is none of them. Name one that is, for example:
     make $(or $(firstword $(MAKECMDGOALS)),test) PYTHON=python3.11
@@ -26,7 +13,7 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format typecheck bench check-gl clean
+.PHONY: help demo test lint format typecheck bench clean
 
 help: ## Show this text
 	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
@@ -37,14 +24,13 @@ help: ## Show this text
 	@echo
 	@echo "  make demo PYTHON=python3.12             which Python $(VENV) is made with: 3.11, 3.12 or 3.13"
 	@echo "  make test ARGS='-k stiffness -x'        arguments for pytest"
-	@echo "  make demo MUJOCO_GL=osmesa              how MuJoCo draws: egl (default on Linux), glfw, osmesa, disable"
 	@echo
 	@echo "The command line behind it: $(BIN)/elastic --help"
 
-demo: $(STAMP) check-gl ## The testbed end to end: identify the spring, compensate it, show table and figures
+demo: $(STAMP) ## The testbed end to end: identify the spring, compensate it, show table and figures
 	$(BIN)/elastic demo
 
-test: $(STAMP) check-gl ## Run the tests, without network or display
+test: $(STAMP) ## Run the tests, without network or display
 	$(BIN)/python -m pytest $(ARGS)
 
 lint: $(STAMP) ## Check style, format and types; changes nothing
@@ -62,9 +48,6 @@ typecheck: $(STAMP) ## Check types only
 bench: $(STAMP) ## Measure the speed of the simulation, then run the benchmarks if there are any
 	$(BIN)/elastic speed
 	$(if $(wildcard tests/benchmarks),$(BIN)/python -m pytest -o addopts= --benchmark-only tests/benchmarks $(ARGS))
-
-check-gl: $(STAMP)
-	@test "$$MUJOCO_GL" = disable || $(BIN)/python -c 'import mujoco; mujoco.GLContext(16, 16).free()' >/dev/null 2>&1 || echo "$$NO_GL" >&2
 
 clean: ## Remove the virtual environment and all caches; results under runs/ stay
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT

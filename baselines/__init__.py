@@ -5,7 +5,9 @@ policy = baselines.make("input", env)
 action, state = policy.predict(observation)
 """
 
+from baselines.compensated import Compensated
 from baselines.compensators import DynamicCompensator, GravityCompensator
-from baselines.policies import Compensated, Policy, make, policy_names
+from baselines.policies import make, policy_names
+from baselines.policy import Policy
 
 __all__ = ["Compensated", "DynamicCompensator", "GravityCompensator", "Policy", "make", "policy_names"]

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import stats
 
 from baselines.gravity_torque import GravityModel, make_gravity
+from baselines.static_points import StaticPoints, link_torque, record_points
 from elastic_env.config import Model
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array, IntArray
@@ -27,42 +28,7 @@ HYSTERESIS_RESOLUTION_RAD = 1e-4
 """Differences between the directions of approach below this are not called hysteresis [rad]."""
 
 _SIGN_ITERATIONS = 5
-_PROGRESS_STEPS = 250
 _RESAMPLES = 999
-
-
-@dataclass(frozen=True)
-class StaticPoints:
-    """Averages of the windows at rest, one entry per visit.
-
-    Attributes:
-        theta: Encoder [rad].
-        q: IMU on the link [rad].
-        direction: Side of approach, +1 from below, -1 from above.
-        position: Number of the static position; its two visits share it.
-        load: Which of the masses was mounted, 0 or 1.
-    """
-
-    theta: Array
-    q: Array
-    direction: IntArray
-    position: IntArray
-    load: IntArray
-
-    def __len__(self) -> int:
-        return len(self.theta)
-
-    @staticmethod
-    def joined(parts: "Sequence[StaticPoints]") -> "StaticPoints":
-        """The points of several loads together, positions numbered through."""
-        first = np.concatenate([[0], np.cumsum([part.position.max() + 1 for part in parts])[:-1]])
-        return StaticPoints(
-            theta=np.concatenate([part.theta for part in parts]),
-            q=np.concatenate([part.q for part in parts]),
-            direction=np.concatenate([part.direction for part in parts]),
-            position=np.concatenate([part.position + start for part, start in zip(parts, first, strict=True)]),
-            load=np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)]),
-        )
 
 
 class Identification(Model):
@@ -70,7 +36,7 @@ class Identification(Model):
 
     stiffness_nm_per_rad: float
     stiffness_low_nm_per_rad: float
-    """Lower end of the 95 % interval (bootstrap over positions)."""
+    """Lower end of the 95 % interval (expanded percentile bootstrap over positions)."""
     stiffness_high_nm_per_rad: float
     friction_nm: float
     dead_band_rad: float
@@ -170,11 +136,12 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
 
     def statistics(chosen: IntArray) -> tuple[float, float]:
         visits = np.concatenate([rows[i] for i in chosen])
-        resampled = fit_points(_subset(points, visits), torque[visits], with_sine_error)
+        resampled = fit_points(points.rows(visits), torque[visits], with_sine_error)
         return resampled.stiffness, resampled.friction
 
     interval = stats.bootstrap(
         (np.arange(len(positions)),), statistics, n_resamples=_RESAMPLES, vectorized=False, method="percentile",
+        confidence_level=_expanded_level(len(positions)),
         rng=np.random.default_rng(seed),
     ).confidence_interval  # fmt: skip
     line: Any = stats.linregress(torque, points.theta - points.q)
@@ -196,84 +163,6 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
         points=len(points),
         positions=len(positions),
     )
-
-
-class HoldRecorder:
-    """Averages encoder and IMU over the windows at rest of a `hold` reference, from observations and infos alone.
-
-    Args:
-        directions: Directions of approach of the windows, (visits,), as `Hold.visits` has them.
-        num_worlds: Worlds that play the reference in step.
-    """
-
-    def __init__(self, directions: IntArray, num_worlds: int = 1) -> None:
-        self._directions = directions
-        self._sums = np.zeros((len(directions), num_worlds, 2))
-        self._counts = np.zeros(len(directions), dtype=np.int64)
-
-    def take(self, encoder: Array, imu: Array, rest: int) -> None:
-        """One control step: encoder and IMU, (num_worlds,) [rad], and the number of the window, -1 outside."""
-        if rest >= 0:
-            self._sums[rest] += np.stack([encoder, imu], axis=-1)
-            self._counts[rest] += 1
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether every window has been visited."""
-        return bool(self._counts.all())
-
-    def points(self) -> list[StaticPoints]:
-        """The averages of every world.
-
-        Raises:
-            ElasticError: A window has no sample: the run ended early.
-        """
-        if not self.is_complete:
-            raise ElasticError(f"the run ended before all {len(self._counts)} static positions were visited")
-        means = self._sums / self._counts[:, None, None]
-        half = len(self._directions) // 2
-        position = np.concatenate([np.arange(half), np.arange(half)[::-1]])
-        load = np.zeros(len(position), dtype=np.int64)
-        return [
-            StaticPoints(means[:, world, 0], means[:, world, 1], self._directions, position, load)
-            for world in range(means.shape[1])
-        ]
-
-
-def record_points(
-    env: Any, seed: int | None = None, progress: Callable[[float], None] | None = None
-) -> list[StaticPoints]:
-    """Drive a testbed, simulated or real, through its `hold` reference without compensation.
-
-    Args:
-        env: Testbed environment with reference "hold", scalar or vector.
-        seed: Seed of the episode, of the first world's in a vector environment.
-        progress: Called with the share of the episode that is done, now and then.
-
-    Returns:
-        The static points of every world; one entry for a scalar environment.
-
-    Raises:
-        ConfigurationError: The environment's reference has no static positions.
-        ElasticError: The episode ended early.
-    """
-    task = env.unwrapped.task
-    if not hasattr(task.config.reference, "visits"):
-        raise ConfigurationError(
-            f"identification needs the reference 'hold', the environment has {task.config.reference.kind!r}"
-        )
-    recorder = HoldRecorder(task.config.reference.visits[1], task.num_worlds)
-    encoder = task.observation_table.names.index("encoder_angle")
-    zero = np.zeros(env.action_space.shape, dtype=np.float32)
-    env.reset(seed=seed)
-    for step in range(task.num_steps):
-        observation, _, terminated, _, info = env.step(zero)
-        recorder.take(observation[..., encoder], info["link_angle_imu"], int(np.max(info["rest"])))
-        if progress is not None and (step + 1) % _PROGRESS_STEPS == 0:
-            progress((step + 1) / task.num_steps)
-        if np.any(terminated):
-            break
-    return recorder.points()
 
 
 def identify(
@@ -300,13 +189,14 @@ def identify(
     return [identify_points(world, gravity, seed=seed or 0) for world in points], points
 
 
-def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], offset: float = 0.0) -> Array:
-    """Gravity torque at the link angles, each under its load, (len(points),) [N·m]; offset as in `Identification`."""
-    torque = np.empty(len(points))
-    for load, model in enumerate(gravity):
-        rows = points.load == load
-        torque[rows] = model.gravity_torque((points.q + offset)[rows, None])[:, 0]
-    return torque
+def _expanded_level(positions: int, level: float = 0.95) -> float:
+    """Level of a percentile interval that covers `level` with few positions, where the plain one is too narrow.
+
+    The expanded percentile interval of T. Hesterberg, "What Teachers Should Know About the Bootstrap", The American
+    Statistician 69(4), 2015: a t quantile and n/(n − 1) in place of the normal quantile.
+    """
+    quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf((1.0 + level) / 2.0, positions - 1)
+    return float(1.0 - 2.0 * stats.norm.sf(quantile))
 
 
 def _link_torque(points: StaticPoints, gravity: Sequence[GravityModel], with_sine_error: bool) -> Array:
@@ -314,9 +204,3 @@ def _link_torque(points: StaticPoints, gravity: Sequence[GravityModel], with_sin
     first = link_torque(points, gravity)
     offset = fit_points(points, first, with_sine_error).coefficients[3]
     return link_torque(points, gravity, float(offset))
-
-
-def _subset(points: StaticPoints, rows: IntArray) -> StaticPoints:
-    return StaticPoints(
-        points.theta[rows], points.q[rows], points.direction[rows], points.position[rows], points.load[rows]
-    )

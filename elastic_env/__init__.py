@@ -10,6 +10,6 @@ __version__ = "0.1.0"
 
 gymnasium.register(
     id="elastic_env/Testbed-v0",
-    entry_point="elastic_env.envs:make_testbed",
-    vector_entry_point="elastic_env.envs:make_testbed_vector",
+    entry_point="elastic_env.entry_points:make_testbed",
+    vector_entry_point="elastic_env.entry_points:make_testbed_vector",
 )

@@ -1,7 +1,6 @@
 """Gymnasium faces of the worlds: one world as an `Env`, many as a `VectorEnv`."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import gymnasium
@@ -11,18 +10,12 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from elastic_env.elasticity import ElasticJoint
 from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.references import Hold, Multisine, Sine, Steps, make_reference
-from elastic_env.rendering import Picture, TestbedPicture
-from elastic_env.robots.elastic_joint import Form
-from elastic_env.robots.robot_model import RobotModel, read_stiffness
-from elastic_env.robots.testbed import Pendulum
-from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.rendering import Picture
+from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array, BoolArray
 from elastic_env.simulation import Simulation
 from elastic_env.tasks.task import Task
-from elastic_env.tasks.testbed import TestbedConfig, TestbedTask
 from elastic_env.worlds import Transition, Worlds
 
 Observation: TypeAlias = npt.NDArray[Any]
@@ -204,65 +197,6 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
         info |= {"final_info": final_info, "_final_info": result.done.copy()}
         return self._worlds.task.observe(), info
-
-
-def configure_testbed(
-    reference: str | dict[str, Any] | Hold | Sine | Multisine | Steps = "hold",
-    scenario: str | Scenario = "nominal",
-    stiffness: float | str | Path | None = None,
-    joint: ElasticJoint | None = None,
-    pendulum: Pendulum | None = None,
-    form: Form = "tendon",
-    observe_link: bool = False,
-) -> TestbedConfig:
-    """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
-
-    Args:
-        reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a reference model.
-        scenario: Name as in `elastic_env.scenario`, or a `Scenario`.
-        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that of the joint.
-        joint: Elastic joint; default the paper's H54-200-S500-R.
-        pendulum: The load; default 60 N·m at the horizontal.
-        form: "tendon", "series" or "rigid".
-        observe_link: Whether the link's IMU is part of the observation.
-
-    Raises:
-        ConfigurationError: A name, a parameter or a combination that does not exist.
-    """
-    chosen = joint if joint is not None else TestbedConfig.model_fields["joint"].default
-    if stiffness is not None:
-        chosen = chosen.replace(stiffness=read_stiffness(stiffness))
-    if form == "series":
-        raise ConfigurationError("the testbed environment has the forms 'tendon' and 'rigid'; 'series' is for checks")
-    return TestbedConfig(
-        reference=make_reference(reference),
-        scenario=make_scenario(scenario),
-        joint=chosen,
-        pendulum=pendulum if pendulum is not None else Pendulum(),
-        form=form,
-        observe_link=observe_link,
-    )
-
-
-def make_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
-    """Entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
-    config = configure_testbed(**arguments)
-    return ElasticEnv(TestbedTask(config, num_worlds=1), render_mode, lambda: TestbedPicture(config.pendulum))
-
-
-def make_testbed_vector(
-    num_envs: int = 1,
-    num_threads: int = 0,
-    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-    render_mode: str | None = None,
-    **arguments: Any,
-) -> ElasticVectorEnv:
-    """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
-    if render_mode is not None:
-        raise ConfigurationError(f"the vector environment does not render, got render_mode {render_mode!r}; use None")
-    if num_envs < 1:
-        raise ConfigurationError(f"num_envs must be at least 1, got {num_envs}")
-    return ElasticVectorEnv(TestbedTask(configure_testbed(**arguments), num_envs), num_threads, autoreset_mode)
 
 
 def _seeds(seed: int | list[int | None] | None, num_envs: int) -> list[int | None]:

@@ -5,7 +5,6 @@ form. Every plan begins with a second of standing, in which policies ramp in, an
 polynomials, which start and end without acceleration.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -13,68 +12,17 @@ from pydantic import Field, model_validator
 
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.signals import Array, BoolArray, IntArray
-
-STAND_S = 1.0
-"""Time at the first position in which policies ramp in; not scored."""
-
-_QUINTIC_PEAK_RATE = 15.0 / 8.0
-_QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Samples of a reference at the control rate; row k is the target at the end of control period k, row 0 the start.
-
-    `scored` marks the rows that count in metrics; `rest` numbers the windows at rest of `Hold`, -1 elsewhere.
-    """
-
-    q: Array
-    q_dot: Array
-    q_ddot: Array
-    scored: BoolArray
-    rest: IntArray
-
-    @property
-    def num_steps(self) -> int:
-        """Control steps of an episode."""
-        return len(self.q) - 1
-
-
-@dataclass(frozen=True)
-class Extent:
-    """Bounds of a reference over all its plans: largest |q| [rad], |q̇| [rad/s], |q̈| [rad/s²]."""
-
-    q: float
-    q_dot: float
-    q_ddot: float
-
-
-def quintic(s: Array) -> tuple[Array, Array, Array]:
-    """Minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1 and its first two derivatives by s, s clipped to [0, 1]."""
-    s = np.clip(s, 0.0, 1.0)
-    return (
-        s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
-        30.0 * s**2 * (1.0 - s) ** 2,
-        60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
-    )
-
-
-def _moves(t: Array, start: float, moves: list[tuple[float, float, float]]) -> tuple[Array, Array, Array]:
-    """Quintic moves (begin [s], duration [s], target [rad]) one after the other, at the times t."""
-    q, q_dot, q_ddot = np.full_like(t, start), np.zeros_like(t), np.zeros_like(t)
-    position = start
-    for begin, duration, target in moves:
-        blend, blend_dot, blend_ddot = quintic((t - begin) / duration)
-        q += (target - position) * blend
-        q_dot += (target - position) * blend_dot / duration
-        q_ddot += (target - position) * blend_ddot / duration**2
-        position = target
-    return q, q_dot, q_ddot
-
-
-def _times(duration_s: float, control_period_s: float) -> Array:
-    return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
+from elastic_env.plan import (
+    QUINTIC_PEAK_ACCELERATION,
+    QUINTIC_PEAK_RATE,
+    STAND_S,
+    Extent,
+    Plan,
+    control_times,
+    quintic,
+    quintic_moves,
+)
+from elastic_env.signals import Array, IntArray
 
 
 class Hold(Model):
@@ -95,6 +43,7 @@ class Hold(Model):
     upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
     rate: float = quantity("rad/s", 0.06, gt=0, description="peak rate of the moves")
     sag: float = quantity("rad", 60 / 1001, ge=0, description="deflection at the horizontal without compensation")
+    shortest_move_s: float = quantity("s", 4.0, gt=0, description="duration of short moves, which ring less if slow")
     settle_s: float = quantity("s", 1.5, ge=0, description="time at rest before the measurement")
     measure_s: float = quantity("s", 0.5, gt=0, description="time of the measurement")
     overrun: float = quantity("rad", 0.08, gt=0, description="how far the sweep starts and turns outside the positions")
@@ -118,11 +67,25 @@ class Hold(Model):
         directions = np.repeat(np.array([1, -1]), len(angles))
         return np.concatenate([angles, angles[::-1]]), directions
 
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return False
+
     def extent(self) -> Extent:
         """See `Extent`."""
         q = float(np.abs(self.angles).max()) + self.overrun
-        shortest = _QUINTIC_PEAK_RATE * float(np.diff(self.angles).min()) / self.rate
-        return Extent(q, self.rate, _QUINTIC_PEAK_ACCELERATION / _QUINTIC_PEAK_RATE * self.rate / shortest)
+        distances = np.append(np.diff(self.angles), self.overrun)
+        durations = np.array([self._move_s(distance) for distance in distances])
+        return Extent(
+            q,
+            q_dot=QUINTIC_PEAK_RATE * float((distances / durations).max()),
+            q_ddot=QUINTIC_PEAK_ACCELERATION * float((distances / durations**2).max()),
+        )
+
+    def _move_s(self, distance: float) -> float:
+        """Duration of a move over a distance [rad]."""
+        return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
         """The plan, the same for every generator."""
@@ -133,7 +96,7 @@ class Hold(Model):
 
         def move(target: float) -> None:
             nonlocal now, position
-            duration = _QUINTIC_PEAK_RATE * abs(target - position) / self.rate
+            duration = self._move_s(abs(target - position))
             moves.append((now, duration, target))
             now, position = now + duration, target
 
@@ -143,8 +106,8 @@ class Hold(Model):
             move(angle)
             windows.append((now + self.settle_s, now + self.settle_s + self.measure_s))
             now = windows[-1][1]
-        t = _times(now, control_period_s)
-        q, q_dot, q_ddot = _moves(t, start, moves)
+        t = control_times(now, control_period_s)
+        q, q_dot, q_ddot = quintic_moves(t, start, moves)
         rest = np.full(len(t), -1)
         for visit, (begin, end) in enumerate(windows):
             rest[(t > begin) & (t <= end + 1e-9)] = visit
@@ -181,7 +144,7 @@ class _Oscillation(Model):
         )
 
     def _time_base(self, control_period_s: float) -> Array:
-        return _times(STAND_S + self.onset_s + self.duration_s, control_period_s)
+        return control_times(STAND_S + self.onset_s + self.duration_s, control_period_s)
 
 
 class Sine(_Oscillation):
@@ -189,6 +152,11 @@ class Sine(_Oscillation):
 
     kind: Literal["sine"] = "sine"
     frequency_hz: float = quantity("Hz", 0.25, gt=0, description="frequency")
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return False
 
     def extent(self) -> Extent:
         """See `Extent`."""
@@ -224,6 +192,11 @@ class Multisine(_Oscillation):
     def _omega(self) -> Array:
         return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
 
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return self.seed is None
+
     def extent(self) -> Extent:
         """See `Extent`."""
         share = self.amplitude / self.components
@@ -252,13 +225,18 @@ class Steps(Model):
     moves: int = quantity("1", 5, ge=1, description="number of moves")
     seed: int | None = quantity("1", None, ge=0, description="seed of the levels; None draws new ones per episode")
 
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return self.seed is None
+
     def extent(self) -> Extent:
         """See `Extent`."""
         span = 2.0 * self.amplitude
         return Extent(
             q=abs(self.middle) + self.amplitude,
-            q_dot=_QUINTIC_PEAK_RATE * span / self.move_s,
-            q_ddot=_QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
+            q_dot=QUINTIC_PEAK_RATE * span / self.move_s,
+            q_ddot=QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
         )
 
     def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
@@ -266,8 +244,8 @@ class Steps(Model):
         offsets = _own(generator, self.seed).uniform(-self.amplitude, self.amplitude, self.moves)
         period = self.move_s + self.rest_s
         moves = [(STAND_S + i * period, self.move_s, float(self.middle + x)) for i, x in enumerate(offsets)]
-        t = _times(STAND_S + self.moves * period, control_period_s)
-        q, q_dot, q_ddot = _moves(t, self.middle, moves)
+        t = control_times(STAND_S + self.moves * period, control_period_s)
+        q, q_dot, q_ddot = quintic_moves(t, self.middle, moves)
         return Plan(q, q_dot, q_ddot, scored=t > STAND_S, rest=np.full(len(t), -1))
 
 

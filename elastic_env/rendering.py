@@ -7,10 +7,11 @@ pendulum is the reference, the solid one the link, the blue pointer the rotor.
 from typing import Any, Protocol
 
 import mujoco
-import mujoco.viewer
 import numpy as np
 import numpy.typing as npt
 
+from elastic_env.errors import ElasticError
+from elastic_env.headless import CURE
 from elastic_env.robots.testbed import Pendulum
 from elastic_env.signals import Signals
 
@@ -62,7 +63,7 @@ class TestbedPicture:
         """See `Picture`."""
         self._pose(signals)
         if self._renderer is None:
-            self._renderer = mujoco.Renderer(self._model, _HEIGHT, _WIDTH)
+            self._renderer = _renderer(self._model)
         self._renderer.update_scene(self._data, camera="front")
         return _with_caption(self._renderer.render().copy(), _caption(signals))
 
@@ -70,11 +71,7 @@ class TestbedPicture:
         """See `Picture`."""
         self._pose(signals)
         if self._viewer is None:
-            self._viewer = mujoco.viewer.launch_passive(
-                self._model, self._data, show_left_ui=False, show_right_ui=False
-            )
-            self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
-            self._viewer.cam.fixedcamid = 0
+            self._viewer = _window(self._model, self._data)
         corner, large = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtFontScale.mjFONTSCALE_150
         self._viewer.set_texts([(large, corner, "\n".join(_caption(signals)), "")])
         self._viewer.sync()
@@ -94,6 +91,25 @@ class TestbedPicture:
         self._data.joint("link").qpos = exaggerated(link, reference)
         self._data.joint("rotor").qpos = exaggerated(rotor, reference)
         mujoco.mj_forward(self._model, self._data)
+
+
+def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
+    try:
+        import mujoco.viewer  # needs GLFW and a display, which a machine that only computes does not have
+
+        viewer = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+    except Exception as error:  # GLFW and MuJoCo raise errors of many types
+        raise ElasticError(f"no window could be opened ({error}); use --video FILE, or rgb_array; {CURE}") from error
+    viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    viewer.cam.fixedcamid = 0
+    return viewer
+
+
+def _renderer(model: mujoco.MjModel) -> Any:
+    try:
+        return mujoco.Renderer(model, _HEIGHT, _WIDTH)
+    except Exception as error:  # MuJoCo's OpenGL backends raise errors of many types
+        raise ElasticError(f"the renderer could not start ({error}); {CURE}") from error
 
 
 def _caption(signals: Signals) -> list[str]:

@@ -6,15 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-import gymnasium
 import tyro
 import yaml
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import track
 
-import elastic_env  # noqa: F401  registers the environments
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError, ElasticError
+from elastic_env.headless import prefer_egl
 
 _CONSOLE = Console()
 
@@ -45,36 +44,10 @@ class Identify:
 
     def run(self) -> None:
         """Identify, write, print."""
-        from baselines.identification import identify
-        from elastic_env.robots.testbed import Pendulum
-        from train import plots
-        from train.runs import new_run
+        from train.identify import IdentifyConfig, run_identification
 
-        if self.repeats < 1:
-            raise ConfigurationError(f"repeats must be at least 1, got {self.repeats}")
-        plots.require_matplotlib()
-        pendulums = [Pendulum()]
-        if self.second_mass is not None:
-            pendulums.append(Pendulum().with_mass_scaled(self.second_mass))
-        envs: list[Any] = [
-            gymnasium.make_vec(
-                "elastic_env/Testbed-v0", num_envs=self.repeats, vectorization_mode="vector_entry_point",
-                reference={"kind": "hold", "positions": self.positions}, scenario=self.scenario,
-                stiffness=self.stiffness, pendulum=pendulum,
-            )
-            for pendulum in pendulums
-        ]  # fmt: skip
-        folder = new_run("identify", _settings(self), self.seed, self.output)
-        with _bar("visiting static positions") as (bar, task):
-            results, points = identify(envs, self.seed, lambda share: bar.update(task, completed=share))
-        results[0].save(folder / "identification.json")
-        models = [env.unwrapped.assumed_model for env in envs]
-        figure = plots.draw_identification(results[0], points[0], models, folder / "identification.png")
-        _print_identification(results[0])
-        if self.repeats > 1:
-            truth = float(envs[0].unwrapped.truth().model.stiffness[0])
-            _print_repeats(results, truth, self.seed, folder / "repeats.csv")
-        _CONSOLE.print(f"wrote {folder / 'identification.json'} and {figure}", soft_wrap=True)
+        config = IdentifyConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+        run_identification(config, _CONSOLE, self.output)
 
 
 @dataclass
@@ -156,10 +129,8 @@ class Speed:
         from train.speed import measure, report
 
         results = []
-        with _bar("measuring") as (bar, task):
-            for i, n in enumerate(self.num_envs):
-                results.append(measure(n, self.steps, self.rounds, self.threads))
-                bar.update(task, completed=(i + 1) / len(self.num_envs))
+        for n in track(self.num_envs, "measuring", console=_CONSOLE, transient=True):
+            results.append(measure(n, self.steps, self.rounds, self.threads))
         _CONSOLE.print(f"wrote {report(results, _CONSOLE, self.output)}", soft_wrap=True)
 
 
@@ -226,6 +197,7 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
+    prefer_egl()
     command: Any = tyro.cli(
         Command, prog="elastic", args=arguments,
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
@@ -238,29 +210,6 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")
         os._exit(130)  # worker processes must not keep the terminal waiting
-
-
-def _bar(title: str) -> Any:
-    return _ProgressBar(title)
-
-
-class _ProgressBar:
-    """A progress bar from 0 to 1 as a context manager: the bar and its task."""
-
-    def __init__(self, title: str) -> None:
-        columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-        self._bar, self._title = Progress(*columns, console=_CONSOLE, transient=True), title
-
-    def __enter__(self) -> tuple[Progress, Any]:
-        self._bar.start()
-        return self._bar, self._bar.add_task(self._title, total=1.0)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-
-def _settings(command: Any) -> dict[str, Any]:
-    return {name: str(v) if isinstance(v, Path) else v for name, v in vars(command).items() if name != "output"}
 
 
 def _name_or_mapping(text: str) -> str | dict[str, Any]:
@@ -279,49 +228,3 @@ def _print_files(comparison: Any) -> None:
     _CONSOLE.print(f"Results in {comparison.folder}:", soft_wrap=True)
     for path in comparison.files:
         _CONSOLE.print(f"  {path}", soft_wrap=True)
-
-
-def _print_identification(result: Any) -> None:
-    from rich.table import Table
-
-    table = Table(title="identification", show_header=False)
-    low, high = result.stiffness_low_nm_per_rad, result.stiffness_high_nm_per_rad
-    rows = [
-        ("stiffness K", f"{result.stiffness_nm_per_rad:.1f} N·m/rad"),
-        ("  95 % interval", f"{low:.1f} to {high:.1f} (± {100 * result.half_width:.2f} %)"),
-        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}"),
-        ("friction", f"{result.friction_nm:.2f} N·m ({result.friction_low_nm:.2f} to {result.friction_high_nm:.2f})"),
-        ("dead band", f"{1e3 * result.dead_band_rad:.2f} mrad"),
-        ("offset", f"{1e3 * result.offset_rad:+.2f} mrad"),
-        ("directions differ", "yes (hysteresis)" if result.hysteresis else "no"),
-        ("residual spread", f"{1e3 * result.residual_rad:.3f} mrad"),
-        ("points", f"{result.points} at {result.positions} positions"),
-    ]
-    if result.imu_sine_error_rad is not None:
-        rows.insert(6, ("IMU error ~ sin q", f"{1e3 * result.imu_sine_error_rad:+.2f} mrad"))
-    for name, value in rows:
-        table.add_row(name, value)
-    _CONSOLE.print(table)
-
-
-def _print_repeats(results: list[Any], truth: float, seed: int, path: Path) -> None:
-    """Spread over the seeds and coverage of the intervals, and one row per seed in a file."""
-    import csv
-
-    import numpy as np
-
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["seed", *results[0].model_dump()])
-        writer.writeheader()
-        writer.writerows({"seed": seed + i, **result.model_dump()} for i, result in enumerate(results))
-    stiffness = np.array([result.stiffness_nm_per_rad for result in results])
-    covered = sum(r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results)
-    widest = max(result.half_width for result in results)
-    _CONSOLE.print(
-        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to {stiffness.max():.1f} "
-        f"N·m/rad (true {truth:g}); friction median {np.median([r.friction_nm for r in results]):.2f} N·m; "
-        f"r median {np.median([r.pearson_r for r in results]):.4f}; plain line median "
-        f"{np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\n"
-        f"the 95 % interval holds the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
-    )
-    _CONSOLE.print(f"wrote {path}", soft_wrap=True)

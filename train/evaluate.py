@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.identification import HoldRecorder, StaticPoints
+from baselines.static_points import HoldRecorder, StaticPoints
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.signals import Array
@@ -119,19 +119,16 @@ def make_vector_env(condition: Condition, num_envs: int, num_threads: int = 0) -
     """
     if condition.env not in ENVIRONMENTS:
         raise unknown_name("environment", condition.env, ENVIRONMENTS)
-    try:
-        return gymnasium.make_vec(
-            ENVIRONMENTS[condition.env],
-            num_envs=num_envs,
-            vectorization_mode="vector_entry_point",
-            num_threads=num_threads,
-            autoreset_mode=AutoresetMode.NEXT_STEP,
-            reference=condition.reference,
-            scenario=condition.scenario,
-            **condition.env_options,
-        )
-    except TypeError as error:
-        raise ConfigurationError(f"environment {condition.env!r}: {error}") from None
+    return gymnasium.make_vec(
+        ENVIRONMENTS[condition.env],
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        num_threads=num_threads,
+        autoreset_mode=AutoresetMode.NEXT_STEP,
+        reference=condition.reference,
+        scenario=condition.scenario,
+        **condition.env_options,
+    )
 
 
 def num_steps(condition: Condition) -> int:

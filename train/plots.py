@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from baselines.gravity_torque import make_gravity
-from baselines.identification import Identification, StaticPoints, link_torque
+from baselines.identification import Identification
+from baselines.static_points import StaticPoints, link_torque
 from elastic_env.errors import missing_extra
 from elastic_env.robots.robot_model import RobotModel
 from train.evaluate import Evaluation

@@ -12,8 +12,7 @@ Three forms of the same joint:
 Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Literal, get_args
 
 import mujoco
@@ -21,7 +20,9 @@ import numpy as np
 
 from elastic_env.elasticity import ElasticJoint, Servo
 from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.signals import Array, IntArray
+from elastic_env.robots.joint_names import link_name, motor_name, servo_name, spring_name
+from elastic_env.robots.keyframes import give_keyframes, take_keyframes
+from elastic_env.signals import Array
 
 Form = Literal["tendon", "series", "rigid"]
 ActuatorRule = Literal["keep", "replace"]
@@ -32,49 +33,6 @@ _ROTOR_MASS = 1e-12  # MuJoCo wants mass on every moving body; the rotor's inert
 # MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
 _FRICTION_SOLREF = (0.001, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-
-
-def motor_name(joint: str) -> str:
-    """Name of the rotor's hinge of an elastic joint."""
-    return f"{joint}_motor"
-
-
-def spring_name(joint: str) -> str:
-    """Name of the tendon of length θ − q."""
-    return f"{joint}_spring"
-
-
-def servo_name(joint: str) -> str:
-    """Name of the servo's actuator."""
-    return f"{joint}_servo"
-
-
-def link_name(joint: str) -> str:
-    """Name of the tendon whose length is q in the series form."""
-    return f"{joint}_link"
-
-
-@dataclass(frozen=True)
-class JointAddresses:
-    """Where motor and link angles of the elastic joints stand in `qpos` and `qvel`, each (n,)."""
-
-    theta: IntArray
-    q: IntArray
-    theta_dot: IntArray
-    q_dot: IntArray
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, joints: Sequence[str]) -> "JointAddresses":
-        """Look the joints up by name, in a model of the tendon or the rigid form."""
-        link = [model.joint(name) for name in joints]
-        known = {model.joint(i).name for i in range(model.njnt)}
-        motor = [model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints]
-        return cls(
-            theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),
-            q=np.array([joint.qposadr[0] for joint in link], dtype=np.int64),
-            theta_dot=np.array([joint.dofadr[0] for joint in motor], dtype=np.int64),
-            q_dot=np.array([joint.dofadr[0] for joint in link], dtype=np.int64),
-        )
 
 
 def make_elastic(
@@ -108,10 +66,10 @@ def make_elastic(
     if actuators not in get_args(ActuatorRule):
         raise unknown_name("actuator rule", actuators, get_args(ActuatorRule))
     elastic = spec.copy()
-    keyframes = _take_keyframes(elastic)
+    keyframes = take_keyframes(elastic)
     for name, joint in joints.items():
         _transform(elastic, _hinge(elastic, name), joint, form, actuators)
-    _give_keyframes(elastic, keyframes, list(joints))
+    give_keyframes(elastic, keyframes, list(joints))
     return elastic
 
 
@@ -263,76 +221,3 @@ def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> Non
     actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])
-
-
-@dataclass(frozen=True)
-class _Keyframes:
-    """The keyframes of the rigid model, and its joints and actuators in the order of their vectors."""
-
-    model: mujoco.MjModel
-    joints: list[mujoco.MjsJoint]
-    actuators: list[mujoco.MjsActuator]
-
-
-def _take_keyframes(spec: mujoco.MjSpec) -> _Keyframes | None:
-    """Remove the keyframes, whose vectors no longer fit once joints are added."""
-    if not spec.keys:
-        return None
-    model = spec.compile()
-    keyframes = _Keyframes(model, sorted(spec.joints, key=lambda j: j.id), sorted(spec.actuators, key=lambda a: a.id))
-    for key in list(spec.keys):
-        spec.delete(key)
-    return keyframes
-
-
-def _give_keyframes(spec: mujoco.MjSpec, keyframes: _Keyframes | None, joints: list[str]) -> None:
-    """Add the keyframes again, with rotors at their link angles and servos holding them."""
-    if keyframes is None:
-        return
-    rigid, model = keyframes.model, spec.compile()
-    series = [name for name in joints if any(t.name == link_name(name) for t in spec.tendons)]
-    for k in range(rigid.nkey):
-        qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
-        for old, joint in enumerate(keyframes.joints):
-            new = joint.id
-            qpos[_range(model.jnt_qposadr, new, model.nq)] = rigid.key_qpos[k, _range(rigid.jnt_qposadr, old, rigid.nq)]
-            qvel[_range(model.jnt_dofadr, new, model.nv)] = rigid.key_qvel[k, _range(rigid.jnt_dofadr, old, rigid.nv)]
-        act, ctrl = np.zeros(model.na), np.zeros(model.nu)
-        for old, actuator in enumerate(keyframes.actuators):
-            if actuator.id < 0 or actuator.name not in {a.name for a in spec.actuators}:
-                continue  # replaced by a servo
-            new = actuator.id
-            ctrl[_ctrl_range(model, new)] = rigid.key_ctrl[k, _ctrl_range(rigid, old)]
-            act[_act_range(model, new)] = rigid.key_act[k, _act_range(rigid, old)]
-        for name in joints:
-            _start_undeflected(model, name, qpos, qvel, ctrl, name in series)
-        spec.add_key(
-            name=rigid.key(k).name, time=rigid.key_time[k], qpos=qpos, qvel=qvel, act=act, ctrl=ctrl,
-            mpos=rigid.key_mpos[k].ravel(), mquat=rigid.key_mquat[k].ravel(),
-        )  # fmt: skip
-
-
-def _start_undeflected(model: mujoco.MjModel, name: str, qpos: Array, qvel: Array, ctrl: Array, series: bool) -> None:
-    """θ = q, θ̇ = q̇ and the servo's command at the link angle, in one keyframe's vectors."""
-    at = JointAddresses.of(model, [name])
-    qpos[at.theta], qvel[at.theta_dot] = qpos[at.q], qvel[at.q_dot]
-    servos = {model.actuator(i).name: i for i in range(model.nactuator)}
-    if servo_name(name) in servos:
-        ctrl[_ctrl_range(model, servos[servo_name(name)])] = qpos[at.theta]
-    if series:
-        qpos[at.q], qvel[at.q_dot] = 0.0, 0.0
-
-
-def _range(starts: IntArray, index: int, total: int) -> slice:
-    """The columns of one element in a vector of all elements, from the elements' first columns."""
-    end = starts[index + 1] if index + 1 < len(starts) else total
-    return slice(int(starts[index]), int(end))
-
-
-def _ctrl_range(model: mujoco.MjModel, index: int) -> slice:
-    return slice(int(model.actuator_ctrladr[index]), int(model.actuator_ctrladr[index] + model.actuator_ctrlnum[index]))
-
-
-def _act_range(model: mujoco.MjModel, index: int) -> slice:
-    first = int(model.actuator_actadr[index])
-    return slice(first, first + int(model.actuator_actnum[index])) if first >= 0 else slice(0, 0)

@@ -20,19 +20,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint, joint_torque, static_deflection, static_link_angle
-from elastic_env.errors import ConfigurationError
 from elastic_env.metrics import Metric
-from elastic_env.references import Hold, Reference
-from elastic_env.robots.dynamixel import H54_200_S500_R
-from elastic_env.robots.elastic_joint import Form, JointAddresses
+from elastic_env.plan import PlanTable
+from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel
-from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec, rigid_spec
-from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
-from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
+from elastic_env.signals import Array, BoolArray, Signal, Signals, SignalTable
 from elastic_env.simulation import Simulation
+from elastic_env.tasks.testbed_config import TestbedConfig, num_substeps, require_feasible
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
@@ -61,51 +58,6 @@ METRICS = (
     Metric("joint_torque_peak_nm", "joint_torque", "peak", scored_only=False),
     Metric("clipped_share", "clipped", "mean", scored_only=False),
 )
-
-
-class RewardWeights(Model):
-    """Weights of the reward terms; every term is a penalty that grows without saturating."""
-
-    link_error: float = quantity("1/rad", 100.0, ge=0, description="per rad of link error: 1 at 0.01 rad")
-    command_rate: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offset")
-    divergence: float = quantity("1", 200.0, ge=0, description="once, where the simulation diverges")
-
-
-class TestbedConfig(Model):
-    """All of the testbed environment."""
-
-    __test__ = False  # not a test class, although its name says so
-
-    reference: Reference = Hold()
-    scenario: Scenario = make_scenario("nominal")
-    joint: ElasticJoint = H54_200_S500_R
-    """The joint as it is known; the scenario says in what the true one differs."""
-    pendulum: Pendulum = Pendulum()
-    form: Form = "tendon"
-    observe_link: bool = False
-    """Whether the link's IMU is part of the observation."""
-    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
-    timestep_s: float = quantity("s", 5e-4, gt=0, description="physics step")
-    reward: RewardWeights = RewardWeights()
-
-    @property
-    def true_joint(self) -> ElasticJoint:
-        """The joint as the plant has it."""
-        return self.joint.replace(
-            stiffness=self.joint.stiffness * self.scenario.stiffness_scale,
-            coulomb_friction=self.joint.coulomb_friction * self.scenario.friction_scale,
-            viscous_friction=self.joint.viscous_friction * self.scenario.friction_scale,
-            backlash=self.joint.backlash + self.scenario.backlash_rad,
-        )
-
-    @property
-    def true_pendulum(self) -> Pendulum:
-        """The pendulum as the plant has it."""
-        return self.pendulum.with_mass_scaled(self.scenario.pendulum_mass_scale)
-
-    def robot_model(self, joint: ElasticJoint, pendulum: Pendulum) -> RobotModel:
-        """Rigid model and joint of this testbed with the given parameters."""
-        return RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), self.control_period_s)
 
 
 @dataclass(frozen=True)
@@ -147,17 +99,17 @@ class TestbedTask:
     metrics: Sequence[Metric] = METRICS
 
     def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
-        _require_feasible(config)
+        require_feasible(config)
         self.config = config
         self.num_worlds = num_worlds
-        self.num_substeps = _num_substeps(config)
+        self.num_substeps = num_substeps(config)
         self.observation_table = SignalTable((*OBSERVATION, LINK_IMU)) if config.observe_link else OBSERVATION
         self.assumed_model = config.robot_model(config.joint, config.pendulum)
         self._true_model = config.robot_model(config.true_joint, config.true_pendulum)
         self.model = elastic_spec(config.true_pendulum, config.true_joint, config.form, config.timestep_s).compile()
         self._at = JointAddresses.of(self.model, [JOINT])
         self._noise = NoiseStream(num_worlds, width=1)
-        self._reference = _ReferenceRows(config, num_worlds)
+        self._reference = PlanTable(config.reference, config.control_period_s, num_worlds)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._theta, self._theta_dot, self._q, self._q_dot = np.zeros((4, num_worlds))
         self._encoder, self._encoder_before, self._imu = np.zeros((3, num_worlds))
@@ -289,75 +241,8 @@ class TestbedTask:
         self._imu[due] = measured[due]
 
 
-@dataclass(frozen=True)
-class _ReferenceRow:
-    """The reference of every world at its present step, (num_worlds,) each."""
-
-    q: Array
-    q_dot: Array
-    q_ddot: Array
-    scored: BoolArray
-    rest: IntArray
-
-
-class _ReferenceRows:
-    """The plans of all worlds as tables, one row per control step; a plan without randomness is held once."""
-
-    def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
-        self._reference, self._period = config.reference, config.control_period_s
-        probe = self._reference.plan(np.random.default_rng(0), self._period)
-        self.num_steps = probe.num_steps
-        self._is_shared = getattr(self._reference, "seed", 0) is not None
-        self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
-        rows = 1 if self._is_shared else num_worlds
-        self._motion = np.tile(np.stack([probe.q, probe.q_dot, probe.q_ddot], axis=-1), (rows, 1, 1))
-        self._scored, self._rest = probe.scored, probe.rest
-
-    def draw(self, world: int, generator: np.random.Generator) -> None:
-        """A new plan for one world."""
-        if not self._is_shared:
-            plan = self._reference.plan(generator, self._period)
-            self._motion[world] = np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1)
-
-    def at(self, step: IntArray) -> _ReferenceRow:
-        """Rows of the given steps, (num_worlds,); beyond the end the last row."""
-        row = np.minimum(step, self.num_steps)
-        motion = self._motion[self._row, row]
-        return _ReferenceRow(motion[:, 0], motion[:, 1], motion[:, 2], self._scored[row], self._rest[row])
-
-
 def _rest_angle(theta: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
     """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
     half = static_deflection(np.sign(theta), np.inf, joint.backlash)
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
     return static_link_angle(engaged, joint.stiffness, pendulum.torque, pendulum.torque_gradient)
-
-
-def _num_substeps(config: TestbedConfig) -> int:
-    ratio = config.control_period_s / config.timestep_s
-    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
-        raise ConfigurationError(
-            "control_period_s must be a multiple of timestep_s, "
-            f"got {config.control_period_s} s and {config.timestep_s} s"
-        )
-    return round(ratio)
-
-
-def _require_feasible(config: TestbedConfig) -> None:
-    """A reference that the servo cannot follow is an error now, not a poor result later."""
-    joint, pendulum, extent = config.true_joint, config.true_pendulum, config.reference.extent()
-    if joint.servo is None:
-        raise ConfigurationError("the testbed's joint needs a servo, got None; see elastic_env.elasticity.Servo")
-    worst_angle = min(extent.q, np.pi / 2)
-    needed = (
-        abs(float(pendulum.torque(np.array(worst_angle))))
-        + (pendulum.inertia + joint.rotor_inertia) * extent.q_ddot
-        + joint.coulomb_friction
-        + joint.viscous_friction * extent.q_dot
-    )
-    if needed > joint.servo.torque_limit:
-        raise ConfigurationError(
-            f"the reference {config.reference.kind!r} can need {needed:.1f} N·m of a servo limited to "
-            f"{joint.servo.torque_limit:.1f} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to {extent.q_ddot:.2f} rad/s²); "
-            "lower its amplitude or its rate"
-        )

@@ -1,0 +1,77 @@
+"""Joint elasticity compensated around any policy (Fig. 2 of the paper)."""
+
+from typing import Any
+
+import numpy as np
+
+from baselines.compensators import Compensator, Motion
+from baselines.policy import Action, ObservationView, Policy, resume
+from elastic_env.plan import STAND_S, quintic
+from elastic_env.signals import Array, SignalTable
+
+
+class Compensated:
+    """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
+
+    The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees the estimated link
+    angle and rate where the observation has the encoder's; the compensator's offset for q_d is added to its action.
+    The compensation grows from zero in the first `ramp_s` of an episode, while the reference stands.
+
+    Args:
+        policy: Anything with `predict`; its state may be anything.
+        compensator: Where the motor has to lead, and where the link is.
+        table: Observation table of the environment, `env.unwrapped.task.observation_table`.
+        control_period_s: Time between observations.
+        ramp_s: Duration of the ramp.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        compensator: Compensator,
+        table: SignalTable,
+        control_period_s: float = 0.004,
+        ramp_s: float = STAND_S,
+    ) -> None:
+        self.policy, self.compensator = policy, compensator
+        self._view = ObservationView(table)
+        self._ramp_steps = max(round(ramp_s / control_period_s), 1)
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Compensated action and new state.
+
+        Raises:
+            ElasticError: Called in the middle of an episode without the state of the last call.
+        """
+        rows = np.atleast_2d(observation)
+        desired = self._view.motion(rows)
+        memory, inner_state = resume(
+            state, episode_start, rows, self._view, lambda: np.pad(self.compensator.begin(desired), ((0, 0), (1, 0)))
+        )
+        action, inner_state = self._inner(rows, inner_state, episode_start, deterministic, observation.ndim, memory)
+        wanted = Motion(desired.q + action, desired.q_dot, desired.q_ddot)
+        offset, kept = self.compensator.offset(wanted, memory[:, 1:])
+        steps = memory[:, :1] + 1.0
+        share, _, _ = quintic(steps / self._ramp_steps)
+        total = (action + share * offset).astype(np.float32)
+        return total.reshape((*observation.shape[:-1], total.shape[-1])), (np.hstack([steps, kept]), inner_state)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Estimated link angle for an observation and the state that `predict` returned for it, (..., n) [rad]."""
+        memory, _ = state
+        theta = self._view.theta(np.atleast_2d(observation))
+        estimate = self.compensator.link_angle(theta, memory[:, 1:])
+        return estimate.reshape((*observation.shape[:-1], estimate.shape[-1]))
+
+    def _inner(
+        self, rows: Array, state: Any, episode_start: Any, deterministic: bool, ndim: int, memory: Array
+    ) -> tuple[Array, Any]:
+        """The wrapped policy's action on an observation whose encoder columns are those of the links."""
+        theta, theta_dot = self._view.theta(rows), self._view.theta_dot(rows)
+        seen = self._view.with_links(
+            rows, self.compensator.link_angle(theta, memory[:, 1:]), self.compensator.link_rate(theta, theta_dot)
+        )
+        action, state = self.policy.predict(seen if ndim > 1 else seen[0], state, episode_start, deterministic)
+        return np.atleast_2d(np.asarray(action, dtype=np.float64)), state

@@ -1,0 +1,127 @@
+"""`elastic identify`: the static experiment, its files and its table."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+import elastic_env  # noqa: F401  registers the environments
+from baselines.identification import Identification, identify
+from elastic_env.config import Model, quantity
+from elastic_env.robots.testbed import Pendulum
+from train import plots
+from train.runs import new_run
+
+
+class IdentifyConfig(Model):
+    """What `elastic identify` does."""
+
+    scenario: str = "nominal"
+    """Scenario of the simulated testbed."""
+    stiffness: float | None = quantity("N·m/rad", None, gt=0, description="true K; None for the paper's")
+    second_mass: float | None = quantity("1", None, gt=0, description="factor on the pendulum's mass in a second run")
+    positions: int = quantity("1", 20, ge=5, description="number of static positions")
+    seed: int = quantity("1", 0, ge=0, description="seed of the first run")
+    repeats: int = quantity("1", 1, ge=1, description="number of runs with seeds of their own")
+
+
+def run_identification(config: IdentifyConfig, console: Console, output: Path | None = None) -> list[Identification]:
+    """Identify the simulated testbed, write `identification.json` and the figure, print the result.
+
+    Args:
+        config: What to do.
+        console: Where progress and table go.
+        output: Folder for the results; default runs/identify, numbered if taken.
+
+    Returns:
+        One result per repetition.
+
+    Raises:
+        ConfigurationError: A name does not exist.
+        ResultsExistError: The output folder holds results.
+    """
+    plots.require_matplotlib()
+    envs = _environments(config)
+    folder = new_run("identify", config.model_dump(mode="json"), config.seed, output)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("visiting static positions", total=1.0)
+        results, points = identify(envs, config.seed, lambda share: bar.update(task, completed=share))
+    results[0].save(folder / "identification.json")
+    models = [env.unwrapped.assumed_model for env in envs]
+    files = [
+        folder / "identification.json",
+        plots.draw_identification(results[0], points[0], models, folder / "identification.png"),
+    ]
+    console.print(result_table(results[0]))
+    if config.repeats > 1:
+        files.append(_write_repeats(results, config.seed, folder / "repeats.csv"))
+        console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
+    for path in files:
+        console.print(f"wrote {path}", soft_wrap=True)
+    return results
+
+
+def result_table(result: Identification) -> Table:
+    """An identification as a table."""
+    low, high = result.stiffness_low_nm_per_rad, result.stiffness_high_nm_per_rad
+    rows = [
+        ("stiffness K", f"{result.stiffness_nm_per_rad:.1f} N·m/rad"),
+        ("  95 % interval", f"{low:.1f} to {high:.1f} (± {100 * result.half_width:.2f} %)"),
+        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}"),
+        ("friction", f"{result.friction_nm:.2f} N·m ({result.friction_low_nm:.2f} to {result.friction_high_nm:.2f})"),
+        ("dead band", f"{1e3 * result.dead_band_rad:.2f} mrad"),
+        ("offset", f"{1e3 * result.offset_rad:+.2f} mrad"),
+        ("directions differ", "yes (hysteresis)" if result.hysteresis else "no"),
+        ("residual spread", f"{1e3 * result.residual_rad:.3f} mrad"),
+        ("points", f"{result.points} at {result.positions} positions"),
+    ]
+    if result.imu_sine_error_rad is not None:
+        rows.insert(6, ("IMU error ~ sin q", f"{1e3 * result.imu_sine_error_rad:+.2f} mrad"))
+    table = Table(title="identification", show_header=False)
+    for name, value in rows:
+        table.add_row(name, value)
+    return table
+
+
+def _environments(config: IdentifyConfig) -> list[Any]:
+    pendulums = [Pendulum()]
+    if config.second_mass is not None:
+        pendulums.append(Pendulum().with_mass_scaled(config.second_mass))
+    return [
+        gymnasium.make_vec(
+            "elastic_env/Testbed-v0", num_envs=config.repeats, vectorization_mode="vector_entry_point",
+            reference={"kind": "hold", "positions": config.positions}, scenario=config.scenario,
+            stiffness=config.stiffness, pendulum=pendulum,
+        )
+        for pendulum in pendulums
+    ]  # fmt: skip
+
+
+def _write_repeats(results: Sequence[Identification], seed: int, path: Path) -> Path:
+    """One row per seed."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["seed", *type(results[0]).model_fields])
+        writer.writeheader()
+        writer.writerows({"seed": seed + i, **result.model_dump()} for i, result in enumerate(results))
+    return path
+
+
+def _spread(results: Sequence[Identification], truth: float) -> str:
+    """Spread over the seeds, and how often the intervals hold the truth."""
+    stiffness = np.array([result.stiffness_nm_per_rad for result in results])
+    covered = sum(r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results)
+    widest = max(result.half_width for result in results)
+    return (
+        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to {stiffness.max():.1f} "
+        f"N·m/rad (true {truth:g}); friction median {np.median([r.friction_nm for r in results]):.2f} N·m; "
+        f"r median {np.median([r.pearson_r for r in results]):.4f}; plain line median "
+        f"{np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\n"
+        f"the 95 % interval holds the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
+    )
