@@ -69,6 +69,8 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         self._worlds = Worlds(task, num_threads=1)
         self._make_picture = picture
         self._picture: Picture | None = None
+        self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
+        self._steps = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -76,12 +78,14 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         """Begin an episode; `options` are not used."""
         super().reset(seed=seed, options=options)
         self._worlds.restart(np.ones(1, dtype=np.bool_), [self.np_random])
+        self._steps = 0
         self._render_human()
         return self._worlds.task.observe()[0], _first(self._worlds.task.signals())
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control period under a command offset [rad]."""
         result = self._worlds.step(np.asarray(action)[None])
+        self._steps += 1
         self._render_human()
         return (
             result.observation[0],
@@ -107,7 +111,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         return self._picture
 
     def _render_human(self) -> None:
-        if self.render_mode == "human":
+        if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
             self._draw().show(self._worlds.task.signals())
 
 

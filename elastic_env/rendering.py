@@ -95,11 +95,13 @@ class TestbedPicture:
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
     try:
-        import mujoco.viewer  # needs GLFW and a display, which a machine that only computes does not have
-
-        viewer = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
-    except Exception as error:  # GLFW and MuJoCo raise errors of many types
-        raise ElasticError(f"no window could be opened ({error}); use --video FILE, or rgb_array; {CURE}") from error
+        import glfw  # only here: a machine that only computes may have neither GLFW nor a display
+        import mujoco.viewer as viewers
+    except (ImportError, RuntimeError) as error:
+        raise ElasticError(f"no window can be opened here ({error}); {CURE}") from error
+    if not glfw.init():  # the viewer itself would end the process
+        raise ElasticError(f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}")
+    viewer = viewers.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
     viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
     viewer.cam.fixedcamid = 0
     return viewer
