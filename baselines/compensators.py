@@ -126,9 +126,10 @@ class GravityCompensator:
         return self._solve(theta, self.stiffness, self.gravity)
 
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """See `Compensator`: the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇."""
+        """See `Compensator`: the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇ at the estimated link angle."""
         K = np.broadcast_to(self.stiffness, theta.shape)
-        return solve_stiffness(K, self.gravity.gravity_gradient(theta), K * theta_dot)
+        q = self._solve(theta, self.stiffness, self.gravity)
+        return solve_stiffness(K, self.gravity.gravity_gradient(q), K * theta_dot)
 
 
 class DynamicCompensator:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.errors import unknown_name
-from elastic_env.rigid_body import RigidBody
+from elastic_env.rigid_body import RigidBody, require_hinge_tree
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array
 
@@ -54,6 +54,7 @@ class BatchedGravity:
     """
 
     def __init__(self, model: RobotModel) -> None:
+        require_hinge_tree(model.rigid, model.joint_names)
         self._rigid = model.rigid
         self._joints = [model.rigid.joint(name).id for name in model.joint_names]
         self._carried = np.array([[_carries(model.rigid, i, j) for j in self._joints] for i in self._joints])

@@ -28,6 +28,8 @@ HYSTERESIS_RESOLUTION_RAD = 1e-4
 """Differences between the directions of approach below this are not called hysteresis [rad]."""
 
 _SIGN_ITERATIONS = 5
+_ANGLE_ITERATIONS = 12  # each gains a digit: the error shrinks by about τ_g′/K
+_SINGULAR = 1e-9  # smallest singular value, relative, of a design that tells its columns apart
 _RESAMPLES = 999
 
 
@@ -62,6 +64,10 @@ class Identification(Model):
         """Half-width of the interval of K relative to K."""
         return (self.stiffness_high_nm_per_rad - self.stiffness_low_nm_per_rad) / (2.0 * self.stiffness_nm_per_rad)
 
+    def link_angles(self, points: StaticPoints) -> Array:
+        """Link angles of static points in the encoder's zero, (len(points),) [rad]."""
+        return corrected_angles(points.q, self.offset_rad, self.imu_sine_error_rad or 0.0)
+
     def save(self, path: Path) -> None:
         """Write the JSON file."""
         path.write_text(self.model_dump_json(indent=2) + "\n")
@@ -78,6 +84,18 @@ class Fit:
 
     coefficients: Array
     residuals: Array
+    is_determined: bool
+    """Whether the points tell all coefficients apart."""
+
+    @property
+    def offset(self) -> float:
+        """θ − q without torque [rad]."""
+        return float(self.coefficients[3])
+
+    @property
+    def imu_sine_error(self) -> float:
+        """Amplitude of an IMU error proportional to sin q [rad]; 0 where it was no regressor."""
+        return -float(self.coefficients[4]) if len(self.coefficients) > 4 else 0.0
 
     @property
     def stiffness(self) -> float:
@@ -90,26 +108,51 @@ class Fit:
         return float(self.coefficients[1] / self.coefficients[0])
 
 
-def fit_points(points: StaticPoints, torque: Array, with_sine_error: bool) -> Fit:
+def fit_points(points: StaticPoints, q: Array, torque: Array, with_sine_error: bool) -> Fit:
     """Least squares of the deflections; the sign of the load, which depends on the friction, by iteration.
 
     Args:
         points: Static points.
-        torque: Gravity torque at the link angles, (len(points),) [N·m].
+        q: Link angles, (len(points),) [rad].
+        torque: Gravity torque at these, (len(points),) [N·m].
         with_sine_error: Whether an IMU error proportional to sin q is a regressor.
     """
     deflection = points.theta - points.q
     direction = points.direction.astype(np.float64)
-    friction = 0.0
-    coefficients, design = np.zeros(4), np.zeros((len(points), 4))
+    constant = [np.ones(len(points)), *([np.sin(q)] if with_sine_error else [])]
+    design, coefficients, friction, rank = np.zeros((len(points), 4)), np.zeros(4), 0.0, 0
     for _ in range(_SIGN_ITERATIONS):
-        columns = [torque, direction, np.sign(torque + friction * direction), np.ones(len(points))]
-        if with_sine_error:
-            columns.append(np.sin(points.q))
-        design = np.stack(columns, axis=1)
-        coefficients = np.linalg.lstsq(design, deflection, rcond=None)[0]
+        design = np.stack([torque, direction, np.sign(torque + friction * direction), *constant], axis=1)
+        scale = np.linalg.norm(design, axis=0)
+        scaled, _, rank, _ = np.linalg.lstsq(design / scale, deflection, rcond=_SINGULAR)
+        coefficients = scaled / scale
         friction = coefficients[1] / coefficients[0]
-    return Fit(coefficients, deflection - design @ coefficients)
+    return Fit(coefficients, deflection - design @ coefficients, is_determined=rank == design.shape[1])
+
+
+def fit_link_angles(
+    points: StaticPoints, gravity: Sequence[GravityModel], with_sine_error: bool
+) -> tuple[Fit, Array, Array]:
+    """The fit with τ at the link angles that it implies itself, by iteration from the IMU's angles.
+
+    Returns:
+        The fit, the link angles in the encoder's zero [rad], and the gravity torque at these [N·m].
+    """
+    q = points.q
+    for _ in range(_ANGLE_ITERATIONS):
+        torque = link_torque(points, gravity, q)
+        fit = fit_points(points, q, torque, with_sine_error)
+        q = corrected_angles(points.q, fit.offset, fit.imu_sine_error)
+    torque = link_torque(points, gravity, q)
+    return fit_points(points, q, torque, with_sine_error), q, torque
+
+
+def corrected_angles(imu: Array, offset: float, sine_error: float) -> Array:
+    """Link angles from those of an IMU that reads q − offset + sine_error · sin q [rad]."""
+    q = imu
+    for _ in range(_ANGLE_ITERATIONS):
+        q = imu + offset - sine_error * np.sin(q)
+    return q
 
 
 def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed: int = 0) -> Identification:
@@ -130,13 +173,18 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
             f"and the directions {np.unique(points.direction).tolist()}"
         )
     with_sine_error = len(gravity) > 1
-    torque = _link_torque(points, gravity, with_sine_error)
-    fit = fit_points(points, torque, with_sine_error)
+    fit, q, torque = fit_link_angles(points, gravity, with_sine_error)
+    if not fit.is_determined:
+        masses = ", and two masses that differ" if with_sine_error else ""
+        raise ElasticError(
+            "the points do not determine stiffness, friction, dead band and offset: positions with torques of both "
+            f"signs are needed{masses}; got {torque.min():.3g} to {torque.max():.3g} N·m"
+        )
     rows = [np.flatnonzero(points.position == position) for position in positions]
 
     def statistics(chosen: IntArray) -> tuple[float, float]:
         visits = np.concatenate([rows[i] for i in chosen])
-        resampled = fit_points(points.rows(visits), torque[visits], with_sine_error)
+        resampled = fit_points(points.rows(visits), q[visits], torque[visits], with_sine_error)
         return resampled.stiffness, resampled.friction
 
     interval = stats.bootstrap(
@@ -153,8 +201,8 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
         friction_low_nm=float(interval.low[1]),
         friction_high_nm=float(interval.high[1]),
         dead_band_rad=float(2.0 * fit.coefficients[2]),
-        offset_rad=float(fit.coefficients[3]),
-        imu_sine_error_rad=-float(fit.coefficients[4]) if with_sine_error else None,
+        offset_rad=fit.offset,
+        imu_sine_error_rad=fit.imu_sine_error if with_sine_error else None,
         line_stiffness_nm_per_rad=float(1.0 / line.slope),
         pearson_r=float(line.rvalue),
         residual_rad=float(np.std(fit.residuals, ddof=len(fit.coefficients))),
@@ -197,10 +245,3 @@ def _expanded_level(positions: int, level: float = 0.95) -> float:
     """
     quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf((1.0 + level) / 2.0, positions - 1)
     return float(1.0 - 2.0 * stats.norm.sf(quantile))
-
-
-def _link_torque(points: StaticPoints, gravity: Sequence[GravityModel], with_sine_error: bool) -> Array:
-    """Torque at the link angles, the IMU read in the encoder's zero: q + c, with c from a first fit."""
-    first = link_torque(points, gravity)
-    offset = fit_points(points, first, with_sine_error).coefficients[3]
-    return link_torque(points, gravity, float(offset))

@@ -22,8 +22,9 @@ from elastic_env.robots.robot_model import RobotModel, read_stiffness
 class PolicyOptions(Model):
     """Options of the named policies, as keyword arguments of `make`."""
 
-    stiffness: float | list[float] | str | Path | None = None
-    """K that the compensator assumes [N·m/rad], or the path of an identification; None for the env's assumed model."""
+    stiffness: Any = None
+    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of an identification;
+    None for the environment's assumed model."""
     output: OutputMethod = "taylor"
     """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10."""
     gravity: GravityMethod = "pinocchio"
@@ -105,4 +106,4 @@ def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
     if options.stiffness is None:
         return model
     given = options.stiffness
-    return model.with_stiffness(given if isinstance(given, list) else read_stiffness(given))
+    return model.with_stiffness(read_stiffness(given) if isinstance(given, int | float | str | Path) else given)

@@ -131,10 +131,10 @@ def record_points(
     return recorder.points()
 
 
-def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], offset: float = 0.0) -> Array:
-    """Gravity torque at the link angles, each under its load, (len(points),) [N·m]; offset as in `Identification`."""
+def link_torque(points: StaticPoints, gravity: Sequence[GravityModel], q: Array) -> Array:
+    """Gravity torque at link angles q, each under the load of its point, (len(points),) [rad] to [N·m]."""
     torque = np.empty(len(points))
     for load, model in enumerate(gravity):
         rows = points.load == load
-        torque[rows] = model.gravity_torque((points.q + offset)[rows, None])[:, 0]
+        torque[rows] = model.gravity_torque(q[rows, None])[:, 0]
     return torque

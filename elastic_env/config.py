@@ -96,12 +96,15 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
         listing = f"; found beside it: {', '.join(known)}" if known else ""
         raise ConfigurationError(f"no configuration file at {file}{listing}")
     try:
-        content = yaml.safe_load(file.read_text())
-    except yaml.YAMLError as error:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
     if not isinstance(content, dict):
         raise ConfigurationError(f"{file} must hold a mapping of parameters, got {type(content).__name__}")
     try:
+        for key in content:
+            if not isinstance(key, str):
+                raise unknown_name(f"parameter of {model.__name__}", key, model.model_fields)
         return model(**content)
     except ConfigurationError as error:
         raise ConfigurationError(f"in {file}: {error}") from None

@@ -142,9 +142,11 @@ def static_link_angle(
     residual = np.full_like(q, np.inf)
     for _ in range(max_iterations):
         residual = K * (q - theta) + torque(q)
-        if np.all(np.abs(residual) <= tolerance * K):
+        open_rows = np.any(np.abs(residual) > tolerance * K, axis=-1, keepdims=True)
+        if not open_rows.any():
             return q
-        q = q - solve_stiffness(K, torque_gradient(q), residual)
+        # rows that are done stay, so that a row does not depend on the rest of its batch
+        q = np.where(open_rows, q - solve_stiffness(K, torque_gradient(q), residual), q)
     raise ElasticError(
         f"Eq. 10 did not converge in {max_iterations} Newton steps: residual {np.abs(residual / K).max():.3g} rad, "
         f"required {tolerance:.3g} rad; is the stiffness (smallest {K.min():.6g} N·m/rad) too low for the load?"
@@ -167,8 +169,8 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
     """
     n = stiffness.shape[-1]
     total = torque_gradient + stiffness[..., None] * np.eye(n)
-    scale = np.abs(stiffness).max()
-    if np.any(np.abs(np.linalg.det(total / scale)) < np.finfo(np.float64).eps):
+    # every row by its own stiffness: the size of K says nothing about singularity
+    if np.any(np.abs(np.linalg.det(total / stiffness[..., None])) < np.finfo(np.float64).eps):
         raise ElasticError(
             "K + ∂τ_g/∂q is singular: gravity cancels the stiffness "
             f"(smallest K {stiffness.min():.6g} N·m/rad); a stiffer joint or a lighter load is needed"

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.rendering import Picture
 from elastic_env.robots.robot_model import RobotModel
-from elastic_env.signals import Array, BoolArray
+from elastic_env.signals import Array, BoolArray, Signals
 from elastic_env.simulation import Simulation
 from elastic_env.tasks.task import Task
 from elastic_env.worlds import Transition, Worlds
@@ -161,7 +161,10 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
         """One control period in every world under command offsets, (num_envs, n) [rad]."""
         restarting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
-        result = self._worlds.step(np.where(restarting[:, None], 0.0, np.asarray(actions)))
+        given = np.asarray(actions)
+        if restarting.any() and given.shape == self.action_space.shape:
+            given = np.where(restarting[:, None], 0.0, given)
+        result = self._worlds.step(given)
         if restarting.any():
             result = self._restarted_instead(result, restarting)
         self._done = result.done
@@ -178,9 +181,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
         self._begin(worlds)
         fresh = self._worlds.task.signals()
-        info = result.info | {key: np.where(worlds, value, result.info[key]) for key, value in fresh.items()}
-        info["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in result.info["reward_terms"].items()}
-        info["termination"] = np.where(worlds, "", info["termination"])
+        info = _restarted_info(result.info, worlds, fresh)
         return Transition(
             self._worlds.task.observe(),
             np.where(worlds, 0.0, result.reward),
@@ -197,7 +198,8 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         final_info = _with_mask(result.info, result.done)
         self._begin(result.done)
         fresh = self._worlds.task.signals()
-        info = {key: np.where(result.done, fresh[key], value) for key, value in result.info.items() if key in fresh}
+        info = _restarted_info(result.info, result.done, fresh)
+        del info["episode_metrics"]
         info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
         info |= {"final_info": final_info, "_final_info": result.done.copy()}
         return self._worlds.task.observe(), info
@@ -211,6 +213,14 @@ def _seeds(seed: int | list[int | None] | None, num_envs: int) -> list[int | Non
     if len(seed) != num_envs:
         raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
     return list(seed)
+
+
+def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> dict[str, Any]:
+    """The info of a step in which some worlds begin anew: theirs is that of the reset."""
+    changed = info | {key: np.where(worlds, value, info[key]) for key, value in fresh.items()}
+    changed["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
+    changed["termination"] = np.where(worlds, "", info["termination"])
+    return changed
 
 
 def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:

@@ -275,7 +275,7 @@ def make_reference(
     if not isinstance(reference, dict):
         raise ConfigurationError(f"a reference is a name, a mapping or a model, got {type(reference).__name__}")
     kind = reference.get("kind")
-    if kind not in REFERENCES:
+    if not isinstance(kind, str) or kind not in REFERENCES:
         raise unknown_name("reference", kind, REFERENCES)
     return REFERENCES[str(kind)](**reference)
 

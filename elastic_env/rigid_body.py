@@ -26,14 +26,9 @@ class RigidBody:
     """
 
     def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
+        require_hinge_tree(model, joints)
         self._model = _convert(model)
         self._data = self._model.createData()
-        names = list(self._model.names)[1:]
-        for joint in joints:
-            if joint not in names:
-                raise unknown_name("joint of the rigid model", joint, names)
-        if len(joints) != len(names):
-            raise ConfigurationError(f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}")
         self._columns = np.array([self._model.joints[self._model.getJointId(joint)].idx_v for joint in joints])
         self._zero = np.array([model.qpos0[model.joint(joint).qposadr[0]] for joint in joints])
 
@@ -69,6 +64,25 @@ class RigidBody:
         return full
 
 
+def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+    """Check that a rigid model moves by the named hinges and nothing else.
+
+    Raises:
+        ConfigurationError: A joint is no hinge, does not exist, or is left out.
+    """
+    names = [model.joint(j).name for j in range(model.njnt)]
+    for name, kind in zip(names, model.jnt_type, strict=True):
+        if kind != mujoco.mjtJoint.mjJNT_HINGE:
+            raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; trees of hinges are needed")
+    for joint in joints:
+        if joint not in names:
+            raise unknown_name("joint of the rigid model", joint, names)
+    if sorted(joints) != sorted(names):
+        raise ConfigurationError(
+            f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}: {', '.join(joints)}"
+        )
+
+
 def _convert(model: mujoco.MjModel) -> pinocchio.Model:
     """Pinocchio's model of a MuJoCo tree of hinges."""
     tree = pinocchio.Model()
@@ -80,8 +94,6 @@ def _convert(model: mujoco.MjModel) -> pinocchio.Model:
         T = T_joint_body[parent] * _placement(model.body_pos[b], model.body_quat[b])
         carrier = joint_of[parent]
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
-            if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-                raise ConfigurationError(f"joint {model.joint(j).name!r} is no hinge; RigidBody takes trees of hinges")
             T_body_anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[j].copy())
             revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[j].copy())
             carrier = tree.addJoint(carrier, revolute, T * T_body_anchor, model.joint(j).name)

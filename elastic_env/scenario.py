@@ -5,6 +5,9 @@ noise, encoder counts), and changes on top of either. A change alone is meant on
 on `ideal`, and changes can be joined: `soft+payload`.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.dynamixel import BACKLASH_BOUND_RAD
@@ -35,17 +38,20 @@ GROUNDS: dict[str, Scenario] = {
     "nominal": Scenario(name="nominal", imu=_IMU),
 }
 
-CHANGES: dict[str, dict[str, object]] = {
-    "soft": {"stiffness_scale": 0.7},
-    "stiff": {"stiffness_scale": 1.3},
-    "payload": {"pendulum_mass_scale": 1.2},
-    "backlash": {"backlash_rad": BACKLASH_BOUND_RAD},
-    "sensor": {
+Change = Callable[[Scenario], dict[str, Any]]
+
+CHANGES: dict[str, Change] = {
+    "soft": lambda _: {"stiffness_scale": 0.7},
+    "stiff": lambda _: {"stiffness_scale": 1.3},
+    "payload": lambda _: {"pendulum_mass_scale": 1.2},
+    "backlash": lambda _: {"backlash_rad": BACKLASH_BOUND_RAD},
+    "sensor": lambda ground: {
         "encoder_bias_rad": _HOMING_ERROR_RAD,
-        "imu": _IMU.replace(bias_spread_rad=_HOMING_ERROR_RAD),
+        "imu": ground.imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
         "delay_steps": 1,
     },
 }
+"""Parameters that a change sets on its ground."""
 
 
 def scenario_names() -> list[str]:
@@ -57,17 +63,22 @@ def make_scenario(name: "str | Scenario") -> Scenario:
     """The scenario of a name such as "nominal", "soft", "ideal+soft" or "soft+payload".
 
     Raises:
-        ConfigurationError: A part of the name does not exist, or a ground stands behind another part.
+        ConfigurationError: A part of the name does not exist, a ground stands behind another part, or two changes set
+            the same parameter.
     """
     if isinstance(name, Scenario):
         return name
     first, *rest = str(name).split("+")
     ground, changes = (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
-    scenario = ground
+    parameters: dict[str, Any] = {}
     for change in changes:
         if change in GROUNDS:
             raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
         if change not in CHANGES:
             raise unknown_name("scenario", change, scenario_names())
-        scenario = scenario.replace(**CHANGES[change])
-    return scenario.replace(name=str(name))
+        added = CHANGES[change](ground)
+        twice = sorted(parameters.keys() & added.keys())
+        if twice:
+            raise ConfigurationError(f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time")
+        parameters |= added
+    return ground.replace(**parameters, name=str(name))

@@ -1,4 +1,4 @@
-"""Small models in the manner of public robots, none of them ours: what the transform to elastic joints must cope with."""
+"""Small models in the manner of public robots, none of them ours: what the transform must cope with."""
 
 QUADRUPED = """
 <mujoco model="quadruped">
@@ -111,7 +111,7 @@ ARM = """
       mpos="1 2 3" mquat="0 1 0 0"/>
   </keyframe>
 </mujoco>"""
-"""Fixed base in frames, three hinges on one body, activations, mimic equality, bounded masses, mocap, a name at risk."""
+"""Fixed base in frames, three hinges on one body, activations, mimic equality, bounded masses, mocap."""
 
 ROVER = """
 <mujoco model="rover">
@@ -142,7 +142,9 @@ ROVER = """
     <velocity joint="right"/>
     <motor name="pan" joint="pan" forcerange="-2 2"/>
   </actuator>
-  <sensor><jointvel name="left_rate" joint="left"/><jointvel joint="right"/><velocimeter name="speed" site="box"/></sensor>
+  <sensor>
+    <jointvel name="left_rate" joint="left"/><jointvel joint="right"/><velocimeter name="speed" site="box"/>
+  </sensor>
   <worldbody><site name="box"/></worldbody>
 </mujoco>"""
 """Free, slide and ball joints beside the hinges, wheels on velocity actuators without names, air and wind."""
@@ -150,13 +152,15 @@ ROVER = """
 FOUR_BAR = """
 <mujoco model="four_bar">
   <option timestep="0.0005" integrator="RK4"/>
-  <default><equality solref="0.005 1"/><joint axis="0 1 0" damping="0.05"/><geom type="capsule" size="0.02" contype="0"/>
+  <default>
+    <equality solref="0.005 1"/><joint axis="0 1 0" damping="0.05"/><geom type="capsule" size="0.02" contype="0"/>
   </default>
   <worldbody>
     <body name="crank"><joint name="crank"/><geom fromto="0 0 0 0 0 0.2"/>
       <body name="coupler" pos="0 0 0.2"><joint name="coupler" range="-170 170"/><geom fromto="0 0 0 0.5 0 0.1"/></body>
     </body>
-    <body name="rocker" pos="0.5 0 0"><joint name="rocker"/><geom fromto="0 0 0 0 0 0.3"/><site name="tip" pos="0 0 0.3"/>
+    <body name="rocker" pos="0.5 0 0">
+      <joint name="rocker"/><geom fromto="0 0 0 0 0 0.3"/><site name="tip" pos="0 0 0.3"/>
     </body>
   </worldbody>
   <equality><connect name="pin" body1="coupler" body2="rocker" anchor="0.5 0 0.1"/></equality>

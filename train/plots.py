@@ -64,7 +64,7 @@ def colour(policy: str, index: int = 0) -> str:
 def draw_identification(result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path) -> Path:
     """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper, and the residuals."""
     plt = require_matplotlib()
-    torque = link_torque(points, [make_gravity(model) for model in models], result.offset_rad)
+    torque = link_torque(points, [make_gravity(model) for model in models], result.link_angles(points))
     deflection = points.theta - points.q
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(3, 1.2))
     line = np.linspace(torque.min() - 3.0, torque.max() + 3.0, 400)
@@ -119,7 +119,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
         style = {"facecolors": face, "edgecolors": colour(policy, index)} if face else {"color": colour(policy, index)}
         low, high = error.min(), error.max()
         axis.scatter(
-            link_torque(points, gravity), error, marker=marker, s=34, linewidths=1.3, zorder=3,
+            link_torque(points, gravity, points.q), error, marker=marker, s=34, linewidths=1.3, zorder=3,
             label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}", **style,
         )  # fmt: skip
         axis.axhspan(low, high, color=colour(policy, index), alpha=0.08, lw=0)

@@ -67,10 +67,23 @@ def make_elastic(
         raise unknown_name("actuator rule", actuators, get_args(ActuatorRule))
     elastic = spec.copy()
     keyframes = take_keyframes(elastic)
+    _resolve_springdampers(elastic, list(joints))
     for name, joint in joints.items():
         _transform(elastic, _hinge(elastic, name), joint, form, actuators)
     give_keyframes(elastic, keyframes, list(joints))
     return elastic
+
+
+def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
+    """Write out springs that are given as time constants: they follow from inertias that the transform changes."""
+    given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
+    if given:
+        model = spec.compile()
+        for hinge in given:
+            compiled = model.joint(hinge.name)
+            hinge.stiffness = np.array([compiled.stiffness[0], 0.0, 0.0])
+            hinge.damping = np.array([compiled.damping[0], 0.0, 0.0])
+            hinge.springdamper = np.zeros(2)
 
 
 def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
@@ -78,6 +91,7 @@ def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
     if name not in hinges:
         raise unknown_name("hinge", name, hinges)
     taken = {j.name for j in spec.joints} | {t.name for t in spec.tendons} | {a.name for a in spec.actuators}
+    taken |= {motor_name(name)} & {b.name for b in spec.bodies}
     for derived in (motor_name(name), spring_name(name), servo_name(name), link_name(name)):
         if derived in taken:
             raise ConfigurationError(f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?")
@@ -100,15 +114,26 @@ def _transform(
         _add_friction(hinge, joint)
         hinge.armature = joint.rotor_inertia
     _drive(spec, name, driven, joint.servo, rule)
+    _follow_actuators(spec, name, driven)
 
 
 def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
     """A body for the rotor beside the link's. Where it is does not matter: it has no mass, only the armature."""
     body = hinge.parent
     parent = body.parent if isinstance(body.parent, mujoco.MjsBody) else spec.worldbody
-    return parent.add_body(
-        name=motor_name(hinge.name), mass=_ROTOR_MASS, inertia=[_ROTOR_MASS] * 3, explicitinertial=True
+    # from a specification of its own, so that the model's defaults, units and bounds of mass do not apply to it
+    blank = mujoco.MjSpec()
+    blank.compiler.degree = hinge.compiler.degree
+    rotor = blank.worldbody.add_body(
+        name=motor_name(""), mass=_ROTOR_MASS, ipos=[0.0] * 3, inertia=[_ROTOR_MASS] * 3, explicitinertial=True
     )
+    if spec.option.density > 0.0 or spec.option.viscosity > 0.0:
+        # without a geom, drag acts on the box of equal inertia, which for a massless rotor is as large as 2 m
+        rotor.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-9, 0.0, 0.0], mass=0.0, group=6, contype=0, conaffinity=0,
+            fluid_ellipsoid=1, fluid_coefs=[0.0] * 5,
+        )  # fmt: skip
+    return parent.add_frame().attach_body(rotor, hinge.name, "")
 
 
 def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody) -> mujoco.MjsJoint:
@@ -130,6 +155,9 @@ def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody
         group=hinge.group,
     )
     rotor.stiffness = rotor.damping = np.zeros(3)
+    rotor.springyield, rotor.actgravcomp = 0.0, False
+    ref = float(_in_radians(hinge, hinge.ref))  # of an attached model the unit may differ from the rotor's
+    rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
     rotor.springdamper = np.zeros(2)
     hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     hinge.actfrcrange = np.zeros(2)
@@ -146,6 +174,7 @@ def _blank_tendon(spec: mujoco.MjSpec, name: str) -> mujoco.MjsTendon:
     tendon = spec.add_tendon(name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE, frictionloss=0.0, armature=0.0)
     tendon.stiffness = tendon.damping = np.zeros(3)
     tendon.springlength = np.zeros(2)
+    tendon.springyield = 0.0
     tendon.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     return tendon
 
@@ -201,6 +230,7 @@ def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rul
     existing = [a for a in spec.actuators if a.trntype in _ON_JOINT and a.target == name]
     for actuator in existing:
         if rule == "replace":
+            _redirect_sensors(spec, actuator.name, name, servo)
             spec.delete(actuator)
         else:
             actuator.target = driven
@@ -208,8 +238,32 @@ def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rul
         _add_servo(spec, servo_name(name), driven, servo)
 
 
+def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
+    """Sensors of the actuator torque on a hinge go where its actuators go."""
+    for sensor in spec.sensors:
+        if sensor.type == mujoco.mjtSensor.mjSENS_JOINTACTFRC and sensor.objname == name:
+            sensor.objname = driven
+
+
+def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
+    """Sensors of an actuator that is replaced read the servo instead."""
+    sensors = [s for s in spec.sensors if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and s.objname == actuator]
+    if sensors and servo is None:
+        raise ConfigurationError(
+            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced; give the joint "
+            f"{joint!r} a servo, or delete the sensor"
+        )
+    for sensor in sensors:
+        sensor.objname = servo_name(joint)
+
+
 def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> None:
     actuator = spec.add_actuator(name=name, target=target, trntype=_JOINT)
+    actuator.damping, actuator.armature = np.zeros(3), 0.0
+    actuator.delay, actuator.nsample = 0.0, 0
+    actuator.actlimited, actuator.actrange = mujoco.mjtLimited.mjLIMITED_FALSE, np.zeros(2)
+    actuator.actearly, actuator.inheritrange = False, 0.0
+    actuator.ctrlrange, actuator.cranklength = np.zeros(2), 0.0
     actuator.set_to_pid(
         kp=servo.position_gain,
         kv=servo.velocity_gain,

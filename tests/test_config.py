@@ -1,0 +1,175 @@
+"""Parameter models and YAML files: what is wrong must be named, with what would be right."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from elastic_env.config import Model, load_yaml, quantity
+from elastic_env.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
+from elastic_env.tasks.testbed_config import TestbedConfig
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+
+
+class Inner(Model):
+    """A nested model."""
+
+    length: float = quantity("m", 1.0, gt=0, le=2, description="a length")
+
+
+class Outer(Model):
+    """A model with every kind of field."""
+
+    rate: float = quantity("Hz", gt=0, description="a rate")
+    count: int = quantity("1", 3, ge=1, description="a number")
+    offset: float = quantity("rad", 0.0, description="an unbounded angle")
+    inner: Inner = Inner()
+    name: str = "x"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({}, r"Outer needs the parameter 'rate' \[Hz\]"),
+        ({"rate": -1.0}, r"Outer\.rate must be a finite number > 0 \[Hz\], got -1\.0"),
+        ({"rate": np.nan}, r"Outer\.rate must be a finite number > 0 \[Hz\], got nan"),
+        ({"rate": np.inf}, r"Outer\.rate must be a finite number > 0 \[Hz\], got inf"),
+        ({"rate": "fast"}, r"Outer\.rate must be .*number.* \[Hz\], got 'fast'"),
+        ({"rate": None}, r"Outer\.rate must be .*number.* \[Hz\], got None"),
+        ({"rate": 1.0, "offset": np.nan}, r"Outer\.offset must be a finite number \[rad\], got nan"),
+        ({"rate": 1.0, "count": 0}, r"Outer\.count must be .*>= 1 \[1\], got 0"),
+        ({"rate": 1.0, "count": 2.5}, r"Outer\.count must be .* \[1\], got 2\.5"),
+        ({"rate": 1.0, "raet": 2.0}, r"unknown parameter of Outer 'raet'; choose one of: rate, count.*'rate'"),
+        (
+            {"rate": 1.0, "inner": {"length": 3.0}},
+            r"Inner\.length must be a finite number > 0 and <= 2 \[m\], got 3\.0",
+        ),
+        (
+            {"rate": 1.0, "inner": {"lenght": 1.0}},
+            r"unknown parameter of Inner 'lenght'; choose one of: length.*'length'",
+        ),
+        ({"rate": 1.0, "inner": 5}, r"Outer\.inner must be .*Inner.*, got 5"),
+    ],
+)
+def test_a_wrong_value_names_parameter_unit_bound_and_itself(values: dict[str, object], message: str) -> None:
+    """Catches an error message without one of the four, also where models are nested."""
+    with pytest.raises(ConfigurationError, match=message):
+        Outer(**values)
+
+
+def test_every_problem_is_reported_at_once() -> None:
+    """Catches a configuration that must be mended error by error."""
+    with pytest.raises(ConfigurationError) as error:
+        Outer(rate=-1.0, count=0, offst=1.0)
+    assert len(str(error.value).splitlines()) == 3
+    for name in ("rate", "count", "offst"):
+        assert name in str(error.value)
+
+
+def test_models_are_frozen_and_their_copies_validated() -> None:
+    """Catches a parameter that changes under the simulation, and a copy that skips the bounds."""
+    outer = Outer(rate=2.0)
+    with pytest.raises(ValueError, match="frozen"):
+        outer.rate = 3.0  # type: ignore[misc]
+    assert outer.replace(count=5) == Outer(rate=2.0, count=5)
+    assert outer.count == 3
+    with pytest.raises(ConfigurationError, match=r"Outer\.rate must be a finite number > 0 \[Hz\], got -3\.0"):
+        outer.replace(rate=-3.0)
+    with pytest.raises(ConfigurationError, match="unknown parameter of Outer 'rte'"):
+        outer.replace(rte=3.0)
+
+
+def test_errors_are_value_errors() -> None:
+    """Catches an error that callers of the standard library's kind would miss."""
+    assert issubclass(ConfigurationError, ElasticError)
+    assert issubclass(ElasticError, ValueError)
+
+
+def test_unknown_names_list_the_choices_and_suggest_the_closest() -> None:
+    """Catches a hint that is no choice, and one where nothing is close."""
+    assert str(unknown_name("policy", "inptu", ["zero", "input"])) == (
+        "unknown policy 'inptu'; choose one of: zero, input. Did you mean 'input'?"
+    )
+    assert str(unknown_name("policy", "xyz", ["zero", "input"])) == "unknown policy 'xyz'; choose one of: zero, input."
+    assert "pip install 'elastic-env[train]'" in str(missing_extra("torch", "train", "training"))
+
+
+def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:
+    """Catches numbers that YAML reads as text, such as 1e3, and nested parameters that are lost."""
+    file = tmp_path / "outer.yaml"
+    file.write_text("rate: 1e3\ncount: 4\ninner:\n  length: 1.5\nname: tëst\n", encoding="utf-8")
+    assert load_yaml(file, Outer) == Outer(rate=1000.0, count=4, inner=Inner(length=1.5), name="tëst")
+    assert load_yaml(str(file), Outer).rate == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", r"outer\.yaml must hold a mapping of parameters, got NoneType"),
+        ("- 1\n- 2\n", r"outer\.yaml must hold a mapping of parameters, got list"),
+        ("rate: [1, 2\n", r"outer\.yaml is not valid YAML"),
+        ("rate: 1\n  count: 2\n", r"outer\.yaml is not valid YAML"),
+        ("rate: !!python/object/apply:os.getcwd []\n", r"outer\.yaml is not valid YAML"),
+        ("rate: -1\n", r"in .*outer\.yaml: Outer\.rate must be a finite number > 0 \[Hz\], got -1"),
+        ("rate: .nan\n", r"in .*outer\.yaml: Outer\.rate must be a finite number > 0 \[Hz\], got nan"),
+        ("rate: 1\nspeed: 2\n", r"in .*outer\.yaml: unknown parameter of Outer 'speed'; choose one of: rate, count"),
+        (
+            "rate: 1\ninner: {width: 1}\n",
+            r"in .*outer\.yaml: .*unknown parameter of Inner 'width'; choose one of: length",
+        ),
+        ("rate: 1\n2: 3\n", r"outer\.yaml.*parameter.*2"),
+        ("rate: 1\nnull: 3\n", r"outer\.yaml.*parameter.*None"),
+    ],
+)
+def test_a_wrong_yaml_file_names_itself_and_the_problem(tmp_path: Path, content: str, message: str) -> None:
+    """Catches a traceback in place of an explanation, code in a file that runs, and keys that are no names."""
+    file = tmp_path / "outer.yaml"
+    file.write_text(content)
+    with pytest.raises(ConfigurationError, match=message):
+        load_yaml(file, Outer)
+
+
+def test_a_file_that_is_no_text_is_an_explained_error(tmp_path: Path) -> None:
+    """Catches a decoding error without the name of the file."""
+    file = tmp_path / "outer.yaml"
+    file.write_bytes(b"\xff\xfe\x00rate: 1")
+    with pytest.raises(ConfigurationError, match=r"outer\.yaml"):
+        load_yaml(file, Outer)
+
+
+def test_a_missing_file_lists_those_beside_it(tmp_path: Path) -> None:
+    """Catches a mistyped path that leaves one searching."""
+    (tmp_path / "compare.yaml").write_text("rate: 1\n")
+    with pytest.raises(
+        ConfigurationError, match=r"no configuration file at .*cmpare\.yaml; found beside it: .*compare\.yaml"
+    ):
+        load_yaml(tmp_path / "cmpare.yaml", Outer)
+    with pytest.raises(ConfigurationError, match="no configuration file at"):
+        load_yaml(tmp_path / "no" / "such.yaml", Outer)
+    with pytest.raises(ConfigurationError, match="no configuration file at"):
+        load_yaml(tmp_path, Outer)
+
+
+def test_a_configuration_of_the_testbed_survives_its_own_dump() -> None:
+    """Catches a resolved configuration, stored beside results, that cannot be read back."""
+    config = TestbedConfig(reference={"kind": "multisine", "seed": 4}, scenario={"name": "own", "stiffness_scale": 0.5})
+    assert TestbedConfig(**config.model_dump()) == config
+
+
+def test_every_parameter_has_a_unit_or_is_no_number() -> None:
+    """Catches a number that nobody can read: all numeric parameters of the testbed carry their unit."""
+
+    def numbers_without_unit(model: type[Model], seen: set[type]) -> list[str]:
+        missing = []
+        for name, field in model.model_fields.items():
+            extra = field.json_schema_extra
+            has_unit = isinstance(extra, dict) and "unit" in extra
+            default = field.default
+            if isinstance(default, Model) and type(default) not in seen:
+                missing += numbers_without_unit(type(default), seen | {type(default)})
+            elif isinstance(default, int | float) and not isinstance(default, bool) and not has_unit:
+                missing.append(f"{model.__name__}.{name}")
+        return missing
+
+    assert numbers_without_unit(TestbedConfig, {TestbedConfig}) == []

@@ -1,0 +1,116 @@
+"""The batched gravity torque against Pinocchio, MuJoCo, finite differences and the closed form of the pendulum."""
+
+import numpy as np
+import pytest
+
+from baselines.gravity_torque import BatchedGravity, GravityModel, make_gravity
+from elastic_env.errors import ConfigurationError
+from elastic_env.robots.robot_model import RobotModel
+from elastic_env.signals import Array
+from tests.trees import ORDER, TREE, bias_of_mujoco, pendulum, robot, tree
+
+METHODS = ("pinocchio", "batched")
+TOLERANCE_NM = 1e-9
+
+ROBOTS = pytest.mark.parametrize("model", [pendulum(), tree()], ids=["testbed", "tree"])
+
+
+def postures(model: RobotModel, *shape: int) -> Array:
+    """Random joint angles, (*shape, n) [rad]."""
+    return np.random.default_rng(7).uniform(-3.0, 3.0, (*shape, len(model.joint_names)))
+
+
+def central_differences(gravity: GravityModel, q: Array, step: float = 1e-5) -> Array:
+    """∂τ_i/∂q_j of one posture, (n, n) [N·m/rad]."""
+    columns = [gravity.gravity_torque(q + step * e) - gravity.gravity_torque(q - step * e) for e in np.eye(len(q))]
+    return np.stack(columns, axis=-1) / (2.0 * step)
+
+
+@ROBOTS
+@pytest.mark.parametrize("method", METHODS)
+def test_gravity_torque_is_the_bias_force_of_mujoco(model: RobotModel, method: str) -> None:
+    """Catches a flipped sign, a forgotten anchor or reference, a wrong frame, and joints in the order of the model."""
+    gravity = make_gravity(model, method)
+    for q in postures(model, 100):
+        np.testing.assert_allclose(gravity.gravity_torque(q), bias_of_mujoco(model, q), rtol=0.0, atol=TOLERANCE_NM)
+
+
+@ROBOTS
+def test_batched_gravity_agrees_with_pinocchio(model: RobotModel) -> None:
+    """Catches a torque or a gradient of the batch that drifts from the reference, also above the diagonal."""
+    q, batched, reference = postures(model, 100), make_gravity(model, "batched"), make_gravity(model, "pinocchio")
+    torque, gradient = batched.gravity_torque(q), batched.gravity_gradient(q)
+    np.testing.assert_allclose(torque, reference.gravity_torque(q), rtol=0.0, atol=TOLERANCE_NM)
+    np.testing.assert_allclose(gradient, reference.gravity_gradient(q), rtol=0.0, atol=TOLERANCE_NM)
+
+
+@ROBOTS
+@pytest.mark.parametrize("method", METHODS)
+def test_gradient_is_the_derivative_of_the_torque(model: RobotModel, method: str) -> None:
+    """Catches a transposed or permuted gradient, and a branch that feels the gravity of another branch."""
+    gravity = make_gravity(model, method)
+    for q in postures(model, 20):
+        np.testing.assert_allclose(gravity.gravity_gradient(q), central_differences(gravity, q), rtol=0.0, atol=2e-8)
+
+
+def test_joints_on_different_branches_do_not_feel_each_other() -> None:
+    """Catches a gradient that couples arm and leg, which no joint of both carries."""
+    gradient = BatchedGravity(tree()).gravity_gradient(postures(tree(), 50))
+    elbow, leg = ORDER.index("elbow"), [ORDER.index(name) for name in ("hip", "knee", "twist")]
+    assert np.all(gradient[:, elbow, leg] == 0.0)
+    assert np.all(gradient[:, leg, elbow] == 0.0)
+    assert np.abs(gradient[:, elbow, ORDER.index("yaw")]).max() > 0.1  # the trunk does carry the arm
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_pendulum_follows_its_closed_form(method: str) -> None:
+    """Catches a cosine for the sine, and q that grows to the wrong side: τ_g = 60 sin q, its gradient 60 cos q."""
+    gravity, q = make_gravity(pendulum(), method), np.linspace(-3.0, 3.0, 61)[:, None]
+    np.testing.assert_allclose(gravity.gravity_torque(q), 60.0 * np.sin(q), rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(gravity.gravity_gradient(q), 60.0 * np.cos(q)[..., None], rtol=0.0, atol=1e-13)
+
+
+@ROBOTS
+@pytest.mark.parametrize("method", METHODS)
+def test_rows_of_a_batch_are_the_single_postures_exactly(model: RobotModel, method: str) -> None:
+    """Catches results that depend on the size of the batch, which would make scalar and vector rollouts differ."""
+    gravity, q = make_gravity(model, method), postures(model, 3, 5)
+    torque, gradient = gravity.gravity_torque(q), gravity.gravity_gradient(q)
+    n = q.shape[-1]
+    assert torque.shape == (3, 5, n)
+    assert gradient.shape == (3, 5, n, n)
+    for i, j in np.ndindex(3, 5):
+        np.testing.assert_array_equal(torque[i, j], gravity.gravity_torque(q[i, j]))
+        np.testing.assert_array_equal(gradient[i, j], gravity.gravity_gradient(q[i, j]))
+
+
+@ROBOTS
+@pytest.mark.parametrize("method", METHODS)
+def test_gravity_leaves_its_argument_alone(model: RobotModel, method: str) -> None:
+    """Catches an in-place shift of the angles by their references."""
+    gravity, q = make_gravity(model, method), postures(model, 4)
+    before = q.copy()
+    gravity.gravity_torque(q)
+    gravity.gravity_gradient(q)
+    np.testing.assert_array_equal(q, before)
+
+
+def test_unknown_method_names_itself_and_the_choices() -> None:
+    """Catches a silent fallback, and a message that does not help."""
+    with pytest.raises(ConfigurationError, match=r"unknown gravity method 'symbolic'.*pinocchio, batched"):
+        make_gravity(pendulum(), "symbolic")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_hinge_that_is_left_out_is_an_error(method: str) -> None:
+    """Catches a model that keeps a joint at zero in silence, or fails later with a bare KeyError."""
+    with pytest.raises(ConfigurationError, match="knee"):
+        make_gravity(robot(TREE, [name for name in ORDER if name != "knee"]), method)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_joint_that_is_no_hinge_is_an_error(method: str) -> None:
+    """Catches a slide taken for a hinge, whose torque is then plainly wrong."""
+    xml = TREE.replace('<joint name="elbow"', '<joint name="elbow" type="slide"')
+    with pytest.raises(ConfigurationError, match="elbow"):
+        make_gravity(robot(xml, ORDER), method)

@@ -1,0 +1,87 @@
+"""Running statistics against NumPy on the recorded samples."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from elastic_env.metrics import EpisodeMetrics, Metric, RunningStatistics, rms
+from elastic_env.signals import Array, BoolArray
+
+STATISTICS = {
+    "rms": lambda x: np.sqrt(np.mean(x**2)),
+    "mean": np.mean,
+    "min": np.min,
+    "max": np.max,
+    "peak": lambda x: np.abs(x).max(),
+}
+METRICS = [Metric(f"x_{s}_rad", "x", s) for s in STATISTICS] + [  # type: ignore[arg-type]
+    Metric("y_rms_rad", "y", "rms", scored_only=False),
+    Metric("x_all_mean_rad", "x", "mean", scored_only=False),
+]
+
+logs = st.tuples(st.integers(1, 12), st.integers(1, 4)).flatmap(
+    lambda shape: st.tuples(
+        hnp.arrays(np.float64, shape, elements=st.floats(-100.0, 100.0, allow_subnormal=False)),
+        hnp.arrays(np.bool_, shape),
+    )
+)
+
+
+@given(log=logs)
+def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray]) -> None:
+    """Catches a statistic under the wrong name, samples of other worlds, and zero where nothing was sampled."""
+    values, sampled = log
+    running = RunningStatistics(["x"], values.shape[1])
+    for row, mask in zip(values, sampled, strict=True):
+        running.update({"x": row}, mask)
+    for name, function in STATISTICS.items():
+        result = running.statistic(Metric("m", "x", name))  # type: ignore[arg-type]
+        for world in range(values.shape[1]):
+            chosen = values[sampled[:, world], world]
+            expected = function(chosen) if len(chosen) else np.nan
+            np.testing.assert_allclose(result[world], expected, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_scored_and_all_steps_are_kept_apart() -> None:
+    """Catches a metric of all steps that leaves out the standing, and one of scored steps that does not."""
+    metrics = EpisodeMetrics(METRICS, 1)
+    for k, scored in enumerate([False, True, True, False]):
+        metrics.update({"x": np.array([float(k)]), "y": np.array([-2.0 * k])}, np.array([scored]))
+    values = {name: value[0] for name, value in metrics.values().items()}
+    assert list(values) == [metric.name for metric in METRICS]
+    assert (values["x_mean_rad"], values["x_min_rad"], values["x_max_rad"]) == (1.5, 1.0, 2.0)
+    assert values["x_all_mean_rad"] == 1.5
+    assert values["y_rms_rad"] == pytest.approx(np.sqrt((0 + 4 + 16 + 36) / 4))
+
+
+def test_an_episode_begins_without_the_samples_of_the_last_one() -> None:
+    """Catches a restart that forgets only the sums, or that forgets the other worlds too."""
+    metrics = EpisodeMetrics(METRICS, 2)
+    everyone = np.ones(2, dtype=bool)
+    metrics.update({"x": np.array([-7.0, -7.0]), "y": np.zeros(2)}, everyone)
+    metrics.restart(np.array([True, False]))
+    assert np.isnan(metrics.values()["x_peak_rad"][0])
+    metrics.update({"x": np.array([3.0, 3.0]), "y": np.zeros(2)}, everyone)
+    values = metrics.values()
+    np.testing.assert_array_equal(values["x_peak_rad"], [3.0, 7.0])
+    np.testing.assert_array_equal(values["x_min_rad"], [3.0, -7.0])
+    np.testing.assert_array_equal(values["x_mean_rad"], [3.0, -2.0])
+    np.testing.assert_allclose(values["x_rms_rad"], [3.0, np.sqrt((49 + 9) / 2)], rtol=1e-15)
+
+
+def test_values_do_not_share_memory_with_what_comes_later() -> None:
+    """Catches metrics of an ended episode that change while the next one runs."""
+    metrics = EpisodeMetrics(METRICS, 1)
+    metrics.update({"x": np.ones(1), "y": np.ones(1)}, np.ones(1, dtype=bool))
+    values = metrics.values()
+    metrics.update({"x": np.full(1, 9.0), "y": np.ones(1)}, np.ones(1, dtype=bool))
+    assert all(value[0] == 1.0 for value in values.values())
+
+
+def test_rms_along_an_axis() -> None:
+    """Catches a standard deviation in place of the root mean square."""
+    x = np.array([[3.0, 1.0], [4.0, 1.0]])
+    np.testing.assert_allclose(rms(x), [np.sqrt(12.5), 1.0], rtol=1e-15)
+    np.testing.assert_allclose(rms(x, axis=1), [np.sqrt(5.0), np.sqrt(8.5)], rtol=1e-15)
