@@ -105,15 +105,15 @@ class TestbedTask:
         self.num_substeps = num_substeps(config)
         self.observation_table = SignalTable((*OBSERVATION, LINK_IMU)) if config.observe_link else OBSERVATION
         self.assumed_model = config.robot_model(config.joint, config.pendulum)
-        self._true_model = config.robot_model(config.true_joint, config.true_pendulum)
-        self.model = elastic_spec(config.true_pendulum, config.true_joint, config.form, config.timestep_s).compile()
+        self._joint, self._pendulum = config.true_joint, config.true_pendulum
+        self._true_model = config.robot_model(self._joint, self._pendulum)
+        self.model = elastic_spec(self._pendulum, self._joint, config.form, config.timestep_s).compile()
         self._at = JointAddresses.of(self.model, [JOINT])
         self._noise = NoiseStream(num_worlds, width=1)
         self._reference = PlanTable(config.reference, config.control_period_s, num_worlds)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._theta, self._theta_dot, self._q, self._q_dot = np.zeros((4, num_worlds))
-        self._encoder, self._encoder_before, self._imu = np.zeros((3, num_worlds))
-        self._shown_encoder, self._shown_encoder_before, self._shown_imu = np.zeros((3, num_worlds))
+        self._measured = self._shown = _Measurement(*np.zeros((3, num_worlds)))
         self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds))
         self._offset, self._offset_before, self._command = np.zeros((3, num_worlds))
 
@@ -136,10 +136,10 @@ class TestbedTask:
         self._command[worlds] = self._reference.at(self._step).q[worlds]
         self._place(simulation, worlds)
         self._read(simulation, worlds)
-        self._measure(worlds)
-        for shown, measured in ((self._shown_encoder, self._encoder), (self._shown_imu, self._imu)):
-            shown[worlds] = measured[worlds]
-        self._encoder_before[worlds] = self._shown_encoder_before[worlds] = self._encoder[worlds]
+        fresh = self._measure(worlds)
+        at_rest = _Measurement(fresh.encoder, fresh.encoder, fresh.imu)
+        self._measured = self._measured.with_worlds(worlds, at_rest)
+        self._shown = self._shown.with_worlds(worlds, at_rest)
 
     def command(self, offset: Array) -> Array:
         """θ_cmd = q_ref + offset, as the servo gets it: it knows its angle only up to the homing error."""
@@ -152,20 +152,17 @@ class TestbedTask:
         self._step += 1
         healthy = ~simulation.diverged()
         self._read(simulation, healthy)
-        shown = self._encoder.copy(), self._encoder_before.copy(), self._imu.copy()
-        self._encoder_before[healthy] = self._encoder[healthy]
-        self._measure(healthy)
-        if self.config.scenario.delay_steps == 0:
-            shown = self._encoder.copy(), self._encoder_before.copy(), self._imu.copy()
-        self._shown_encoder, self._shown_encoder_before, self._shown_imu = shown
+        before, self._measured = self._measured, self._measure(healthy)
+        self._shown = before if self.config.scenario.delay_steps else self._measured
 
     def observe(self) -> Array:
         """See the table of the module."""
         coming = self._reference.at(self._step + 1)
-        rate = (self._shown_encoder - self._shown_encoder_before) / self.config.control_period_s
-        columns = [self._shown_encoder, rate, coming.q, coming.q_dot, coming.q_ddot, self._command]
+        shown = self._shown
+        rate = (shown.encoder - shown.encoder_before) / self.config.control_period_s
+        columns = [shown.encoder, rate, coming.q, coming.q_dot, coming.q_ddot, self._command]
         if self.config.observe_link:
-            columns.append(self._shown_imu)
+            columns.append(shown.imu)
         return np.stack(columns, axis=-1)
 
     def signals(self) -> Signals:
@@ -176,9 +173,9 @@ class TestbedTask:
             "time_s": self._step * self.config.control_period_s,
             "reference_angle": reference.q,
             "link_angle": self._q.copy(),
-            "link_angle_imu": self._shown_imu.copy(),
+            "link_angle_imu": self._shown.imu.copy(),
             "link_error": reference.q - self._q,
-            "link_error_imu": reference.q - self._shown_imu,
+            "link_error_imu": reference.q - self._shown.imu,
             "deflection": truth.deflection[:, 0],
             "joint_torque": truth.joint_torque[:, 0],
             "servo_error": self._command - self._encoder_bias - self._theta,
@@ -209,14 +206,14 @@ class TestbedTask:
 
     def truth(self) -> TestbedTruth:
         """State without noise, and the true parameters."""
-        joint = self.config.true_joint
+        joint = self._joint
         deflection, deflection_rate = self._theta - self._q, self._theta_dot - self._q_dot
         torque = joint_torque(deflection, deflection_rate, joint.stiffness, joint.damping, joint.backlash)
         columns = (self._theta, self._theta_dot, self._q, self._q_dot, deflection, torque)
         return TestbedTruth(*(column[:, None].copy() for column in columns), model=self._true_model)
 
     def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
-        joint, pendulum = self.config.true_joint, self.config.true_pendulum
+        joint, pendulum = self._joint, self._pendulum
         theta = (self._command - self._encoder_bias)[worlds, None]
         q = theta if self.config.form == "rigid" else _rest_angle(theta, joint, pendulum)
         simulation.qpos[np.ix_(worlds, self._at.theta)] = theta
@@ -232,13 +229,34 @@ class TestbedTask:
         self._q[worlds] = simulation.qpos[worlds, at.q[0]]
         self._q_dot[worlds] = simulation.qvel[worlds, at.q_dot[0]]
 
-    def _measure(self, worlds: BoolArray) -> None:
-        scenario, joint = self.config.scenario, self.config.joint
-        counts = joint.encoder_counts_per_turn if scenario.encoder_counts else None
-        self._encoder[worlds] = quantise(self._theta + self._encoder_bias, counts)[worlds]
+    def _measure(self, worlds: BoolArray) -> "_Measurement":
+        """What the sensors say now; the other worlds keep their last values."""
+        scenario, last = self.config.scenario, self._measured
+        counts = self._joint.encoder_counts_per_turn if scenario.encoder_counts else None
         due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
-        measured = attitude(scenario.imu, self._q, self._imu_bias, self._noise.next(due)[:, 0])
-        self._imu[due] = measured[due]
+        imu = attitude(scenario.imu, self._q, self._imu_bias, self._noise.next(due)[:, 0])
+        return _Measurement(
+            encoder=np.where(worlds, quantise(self._theta + self._encoder_bias, counts), last.encoder),
+            encoder_before=np.where(worlds, last.encoder, last.encoder_before),
+            imu=np.where(due, imu, last.imu),
+        )
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """Sensor values, (num_worlds,) each [rad]; the encoder also a control period earlier."""
+
+    encoder: Array
+    encoder_before: Array
+    imu: Array
+
+    def with_worlds(self, worlds: BoolArray, other: "_Measurement") -> "_Measurement":
+        """These values with those of another measurement in some worlds."""
+        return _Measurement(
+            np.where(worlds, other.encoder, self.encoder),
+            np.where(worlds, other.encoder_before, self.encoder_before),
+            np.where(worlds, other.imu, self.imu),
+        )
 
 
 def _rest_angle(theta: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
