@@ -48,12 +48,12 @@ class RunningStatistics:
 
     def update(self, signals: Signals, sampled: BoolArray) -> None:
         """Take one sample of every signal, (num_worlds,) each, in the worlds where `sampled` is true."""
-        for name, row in self._row.items():
-            values = signals[name]
-            self._sum[row] += np.where(sampled, values, 0.0)
-            self._sum_of_squares[row] += np.where(sampled, np.square(values), 0.0)
-            np.minimum(self._low[row], values, out=self._low[row], where=sampled)
-            np.maximum(self._high[row], values, out=self._high[row], where=sampled)
+        values = np.array([signals[name] for name in self._row], dtype=np.float64).reshape(self._sum.shape)
+        counted = np.where(sampled, values, 0.0)  # where, not a product: a nan outside does not count
+        self._sum += counted
+        self._sum_of_squares += counted * counted
+        np.minimum(self._low, values, out=self._low, where=sampled)
+        np.maximum(self._high, values, out=self._high, where=sampled)
         self._count += sampled
 
     def statistic(self, metric: Metric) -> Array:
