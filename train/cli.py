@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 import yaml
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 
 from elastic_env.config import load_yaml
@@ -205,7 +206,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         command.run()
     except ElasticError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        Console(stderr=True).print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 from pydantic import field_validator
+from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -34,9 +36,9 @@ from train.runs import new_run
 _SUMMARY = (
     ("rms", "link_error_rms_rad"),
     ("peak", "link_error_peak_rad"),
-    ("IMU min", "link_error_imu_min_rad"),
-    ("IMU max", "link_error_imu_max_rad"),
-    ("estimate", "link_estimate_error_rms_rad"),
+    ("IMU-", "link_error_imu_min_rad"),
+    ("IMU+", "link_error_imu_max_rad"),
+    ("est.", "link_estimate_error_rms_rad"),
 )
 
 
@@ -133,12 +135,17 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
 
 def summary_table(evaluations: Sequence[Evaluation]) -> Table:
     """Median over the episodes of every cell, angles in mrad, failures beside them, never averaged in."""
-    table = Table(title="link error and error of its estimate [mrad], median over episodes")
+    table = Table(
+        title=escape("link error [mrad], median over episodes"),
+        caption="IMU- and IMU+: range by the link's IMU; est.: rms error of the policy's estimate of the link angle",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
     for name in ("reference", "scenario", "policy"):
         table.add_column(name, no_wrap=True)
     for title, _ in _SUMMARY:
-        table.add_column(title, justify="right")
-    table.add_column("failed", justify="right")
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("failed", justify="right", no_wrap=True)
     previous = None
     for evaluation in evaluations:
         cell = evaluation.condition.reference_name, evaluation.condition.scenario
@@ -155,8 +162,13 @@ def _medians(evaluation: Evaluation) -> list[str]:
     cells = []
     for _, metric in _SUMMARY:
         values = [episode[metric] for episode in completed if metric in episode]
-        cells.append(f"{1e3 * float(np.median(values)):.2f}" if values else "-")
+        cells.append(_mrad(float(np.median(values))) if values else "-")
     return cells
+
+
+def _mrad(angle: float) -> str:
+    """An angle in mrad with three figures or so."""
+    return f"{1e3 * angle:.{2 if abs(angle) < 0.01 else 1}f}"
 
 
 def _failures(evaluation: Evaluation) -> str:

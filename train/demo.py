@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 import baselines.identification as identification
@@ -63,5 +64,5 @@ def _paper_table(result: identification.Identification, static: list[Evaluation]
     for evaluation, paper in zip(static, ("-56.2 to +41.7", "-3.7 to +7.1"), strict=True):
         error = 1e3 * plots.static_errors(evaluation)
         name = evaluation.condition.policy.title
-        table.add_row(f"link error at rest, {name} [mrad]", f"{error.min():+.1f} to {error.max():+.1f}", paper)
+        table.add_row(escape(f"link error at rest, {name} [mrad]"), f"{error.min():+.1f} to {error.max():+.1f}", paper)
     return table

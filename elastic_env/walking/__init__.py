@@ -1,0 +1,1 @@
+"""Walking patterns: timing, preview control of the center of mass, leg kinematics."""
