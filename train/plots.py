@@ -189,7 +189,7 @@ def draw_overview(evaluations: Sequence[Evaluation], metric: str, path: Path) ->
         label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
     figure.legend(
-        handles.values(), handles.keys(), ncols=len(policies), loc="lower center", bbox_to_anchor=(0.5, -0.06)
+        handles.values(), handles.keys(), ncols=len(policies), loc="lower center", bbox_to_anchor=(0.5, -0.14)
     )
     return _save(plt, figure, path)
 
