@@ -330,6 +330,21 @@ def test_oracle_takes_no_stiffness() -> None:
         baselines.make("oracle", scalar(), stiffness=900.0)
 
 
+def test_oracle_integrates_the_true_link_error_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an integrator that pushes away from the target, in another unit of time, or without bound: 1/s, 50 mrad."""
+    env = scalar()
+    policy = baselines.make("oracle", env, **AT_ONCE)
+    observation, _ = env.reset(seed=0)
+    q_ref = observation[column(env, "reference_angle")]
+    monkeypatch.setattr(env.unwrapped, "truth", lambda: SimpleNamespace(q=np.array([[q_ref - 0.02]])))
+    state, actions = None, []
+    for _ in range(800):
+        action, state = policy.predict(observation, state)
+        actions.append(float(action[0]) - float(actions[0] if actions else 0.0))
+    np.testing.assert_allclose(actions[1:600:100], 0.02 * PERIOD_S * np.arange(1, 600, 100), rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(actions[700:], 0.05, rtol=0.0, atol=1e-7)
+
+
 def test_foreign_environment_is_an_error_with_a_cure() -> None:
     """Catches an AttributeError from deep inside."""
     with pytest.raises(ConfigurationError, match=r"assumed model, got CartPoleEnv.*Testbed-v0"):

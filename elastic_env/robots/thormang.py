@@ -5,10 +5,10 @@ forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs. 
 
 * lengths, masses and COMs of pelvis and legs, hip spacing 0.210 m, sole 0.26 × 0.16 m, ankle 0.100 m above the sole:
   THORMANG "mk2", UPenn-RoboCup/UPennDev2, Robots/THOROP1/THOROPKinematics.h;
-* inertias of thigh, shank, foot, hip and ankle: THORMANG3 CAD values, mass-scaled, thor-mang/ROBOTIS-THORMANG-Common;
-  hip yaw: a box of 0.16 × 0.08 × 0.10 m, assumed;
-* upper body: torso, waist, bent arms of the same header, head of psh117/thormang_mobile, and 4.7 kg of packs, assumed, to
-  reach the paper's 57 kg;
+* inertias of thigh, shank, foot, hip and ankle: THORMANG3 CAD values scaled by mass, from
+  thor-mang/ROBOTIS-THORMANG-Common; hip yaw: a box of 0.16 × 0.08 × 0.10 m, assumed;
+* upper body: torso, waist, bent arms of the same header, head of psh117/thormang_mobile, and 4.7 kg of packs, assumed,
+  to reach the paper's 57 kg;
 * joint limits: THORMANG3, assumed for this robot.
 """
 
