@@ -61,6 +61,8 @@ def _explain_one(model: type[BaseModel], problem: Mapping[str, Any]) -> str:
     if problem["type"] == "value_error":
         message = str(problem["ctx"]["error"])
         return f"{name}: {message}" if name else message
+    if problem["type"] == "too_short":
+        return f"{model.__name__}.{name} needs at least {problem['ctx']['min_length']} entry, got {problem['input']!r}"
     requirement = _bounds(model, name) or problem["msg"].removeprefix("Input should be ")
     return f"{model.__name__}.{name} must be {requirement}{_unit(model, name)}, got {problem['input']!r}"
 

@@ -331,7 +331,7 @@ def test_oracle_takes_no_stiffness() -> None:
 
 
 def test_oracle_integrates_the_true_link_error_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an integrator that pushes away from the target, in another unit of time, or without bound: 1/s, 50 mrad."""
+    """Catches an integrator of the wrong sign, in another unit of time, or without bound: 1 per s up to 50 mrad."""
     env = scalar()
     policy = baselines.make("oracle", env, **AT_ONCE)
     observation, _ = env.reset(seed=0)

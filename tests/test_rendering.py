@@ -115,6 +115,16 @@ def test_environment_renders_again_after_it_was_closed() -> None:
     env.close()
 
 
+def test_picture_draws_again_after_it_was_closed() -> None:
+    """Catches a picture that keeps the renderer that it has freed."""
+    drawn = TestbedPicture(Pendulum())
+    first = drawn.rgb(signals())
+    drawn.close()
+    drawn.close()
+    np.testing.assert_array_equal(drawn.rgb(signals()), first)
+    drawn.close()
+
+
 def test_without_render_mode_there_is_no_picture() -> None:
     """Catches a renderer that is made for nobody."""
     env = gymnasium.make(ID).unwrapped

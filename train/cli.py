@@ -10,7 +10,6 @@ import tyro
 import yaml
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import track
 
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError, ElasticError
@@ -127,12 +126,10 @@ class Speed:
 
     def run(self) -> None:
         """Measure and report."""
-        from train.speed import measure, report
+        from train.speed import SpeedConfig, measure_all
 
-        results = []
-        for n in track(self.num_envs, "measuring", console=_CONSOLE, transient=True):
-            results.append(measure(n, self.steps, self.rounds, self.threads))
-        _CONSOLE.print(f"wrote {report(results, _CONSOLE, self.output)}", soft_wrap=True)
+        config = SpeedConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+        _CONSOLE.print(f"wrote {measure_all(config, _CONSOLE, self.output)}", soft_wrap=True)
 
 
 @dataclass
@@ -199,6 +196,8 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
     prefer_egl()
+    if "" not in sys.path and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
     command: Any = tyro.cli(
         Command, prog="elastic", args=arguments,
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
@@ -214,7 +213,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _name_or_mapping(text: str) -> str | dict[str, Any]:
-    value = yaml.safe_load(text)
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigurationError(
+            f"{text!r} is neither a name nor a mapping such as '{{kind: sine, amplitude: 0.3}}'"
+        ) from None
     return value if isinstance(value, dict) else text
 
 

@@ -4,6 +4,7 @@ import csv
 import multiprocessing
 import os
 import queue
+import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import field_validator
+from pydantic import Field, field_validator
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -48,10 +49,12 @@ class CompareConfig(Model):
     name: str
     """Name of the result folder under runs/."""
     env: str = "testbed"
-    references: list[str | dict[str, Any]] = ["hold"]
+    references: list[str | dict[str, Any]] = Field(default=["hold"], min_length=1)
     """References by name, or mappings with `kind` and parameters."""
-    scenarios: list[str] = ["nominal"]
-    policies: list[PolicySpec] = [PolicySpec(name="uncompensated"), PolicySpec(name="input")]
+    scenarios: list[str] = Field(default=["nominal"], min_length=1)
+    policies: list[PolicySpec] = Field(
+        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1
+    )
     """Baselines by name, or mappings with name, label and options."""
     episodes: int = quantity("1", 1, ge=1, description="episodes per cell")
     seed: int = quantity("1", 0, ge=0, description="seed of the first episode")
@@ -69,10 +72,11 @@ class CompareConfig(Model):
         """All cells, in the order reference, scenario, policy."""
         return [
             Condition(
-                env=self.env, policy=policy, reference=reference, scenario=scenario, env_options=self.env_options,
+                env=self.env, policy=policy, reference=reference, label=label, scenario=scenario,
+                env_options=self.env_options,
                 episodes=self.episodes, seed=self.seed,
             )
-            for reference in self.references
+            for reference, label in zip(self.references, _reference_labels(self.references), strict=True)
             for scenario in self.scenarios
             for policy in self.policies
         ]  # fmt: skip
@@ -100,6 +104,8 @@ def compare(config: CompareConfig, console: Console, output: Path | None = None,
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
         ResultsExistError: The output folder holds results.
     """
+    if jobs < 0:
+        raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {jobs}")
     plots.require_matplotlib()
     conditions = config.conditions()
     for condition in conditions:
@@ -158,22 +164,29 @@ def summary_table(evaluations: Sequence[Evaluation]) -> Table:
 
 
 def _medians(evaluation: Evaluation) -> list[str]:
+    """Medians of the summary's metrics over the episodes that did not fail [mrad], - where there are none."""
     completed = [episode for episode in evaluation.episodes if not episode["termination"]]
     cells = []
     for _, metric in _SUMMARY:
         values = [episode[metric] for episode in completed if metric in episode]
-        cells.append(_mrad(float(np.median(values))) if values else "-")
+        cells.append(f"{1e3 * float(np.median(values)):.2f}" if values else "-")
     return cells
-
-
-def _mrad(angle: float) -> str:
-    """An angle in mrad with three figures or so."""
-    return f"{1e3 * angle:.{2 if abs(angle) < 0.01 else 1}f}"
 
 
 def _failures(evaluation: Evaluation) -> str:
     failed = sum(1 for episode in evaluation.episodes if episode["termination"])
     return f"{failed}/{len(evaluation.episodes)}"
+
+
+def _reference_labels(references: Sequence[str | dict[str, Any]]) -> list[str | None]:
+    """Names that tell references of one kind apart by their parameters; None where the kind is enough."""
+    kinds = [reference if isinstance(reference, str) else str(reference.get("kind")) for reference in references]
+    return [
+        " ".join([kind, *(f"{k}={v}" for k, v in reference.items() if k != "kind")])
+        if kinds.count(kind) > 1 and isinstance(reference, dict)
+        else None
+        for kind, reference in zip(kinds, references, strict=True)
+    ]
 
 
 def _try_out(condition: Condition) -> None:
@@ -236,7 +249,7 @@ def _draw(evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
     files = [plots.draw_overview(evaluations, "link_error_rms_rad", folder / "overview.png")]
     for group in _groups(evaluations):
         condition = group[0].condition
-        stem = f"{condition.reference_name}_{condition.scenario}".replace("+", "_")
+        stem = re.sub(r"[^\w.=-]+", "_", f"{condition.reference_name}_{condition.scenario}")
         files.append(plots.draw_time_series(group, folder / f"time_{stem}.png"))
         if group[0].points is not None:
             model = make_vector_env(condition, 1).unwrapped.assumed_model

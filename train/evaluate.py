@@ -57,6 +57,8 @@ class Condition(Model):
     env: str = "testbed"
     policy: PolicySpec
     reference: str | dict[str, Any] = "hold"
+    label: str | None = None
+    """How tables and figures call the reference; None for its kind."""
     scenario: str = "nominal"
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
@@ -65,7 +67,9 @@ class Condition(Model):
 
     @property
     def reference_name(self) -> str:
-        """Kind of the reference."""
+        """Label or kind of the reference."""
+        if self.label is not None:
+            return self.label
         return self.reference if isinstance(self.reference, str) else str(self.reference.get("kind"))
 
 

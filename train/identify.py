@@ -3,10 +3,11 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gymnasium
 import numpy as np
+from pydantic import model_validator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -29,6 +30,12 @@ class IdentifyConfig(Model):
     positions: int = quantity("1", 20, ge=5, description="number of static positions")
     seed: int = quantity("1", 0, ge=0, description="seed of the first run")
     repeats: int = quantity("1", 1, ge=1, description="number of runs with seeds of their own")
+
+    @model_validator(mode="after")
+    def _masses_differ(self) -> Self:
+        if self.second_mass == 1.0:
+            raise ValueError("second_mass must differ from 1: two equal masses do not separate anything")
+        return self
 
 
 def run_identification(config: IdentifyConfig, console: Console, output: Path | None = None) -> list[Identification]:

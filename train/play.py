@@ -28,6 +28,8 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         ResultsExistError: The video file exists.
         MissingExtraError: The video writer is not installed.
     """
+    if max_s is not None and not max_s > 0.0:
+        raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
     env: Any = gymnasium.make(
         ENVIRONMENTS[condition.env], render_mode="human" if video is None else "rgb_array",
         reference=condition.reference, scenario=condition.scenario, **condition.env_options,

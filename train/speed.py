@@ -7,18 +7,31 @@ import threading
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import mujoco
 import numpy as np
+from pydantic import Field
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
+from elastic_env.config import Model, quantity
 from elastic_env.signals import Array
 from train.evaluate import ENVIRONMENTS
 from train.runs import new_run
+
+
+class SpeedConfig(Model):
+    """What `elastic speed` measures."""
+
+    num_envs: list[Annotated[int, Field(ge=1)]] = Field(default=[64, 1024], min_length=1)
+    """Numbers of worlds."""
+    steps: int = quantity("1", 50, ge=1, description="control steps per round")
+    rounds: int = quantity("1", 7, ge=1, description="rounds, of which medians are reported")
+    threads: int = quantity("1", 0, ge=0, description="threads of both contenders, 0 for all cores")
 
 
 @dataclass(frozen=True)
@@ -114,17 +127,31 @@ class _RawWorlds:
                 mujoco.mj_step(model, data, substeps)
 
 
-def report(results: list[SpeedResult], console: Console, output: Path | None = None) -> Path:
-    """Print the ratios and write them as JSON."""
+def measure_all(config: SpeedConfig, console: Console, output: Path | None = None) -> Path:
+    """Measure every number of worlds, print the ratios, and write them as JSON.
+
+    Args:
+        config: What to measure.
+        console: Where progress and table go.
+        output: Folder for the results; default runs/speed, numbered if taken.
+
+    Returns:
+        The file.
+
+    Raises:
+        ResultsExistError: The output folder holds results.
+    """
+    path = new_run("speed", config.model_dump(mode="json"), None, output) / "speed.json"
+    results = [
+        measure(n, config.steps, config.rounds, config.threads)
+        for n in track(config.num_envs, "measuring", console=console, transient=True)
+    ]
     table = Table(title="vector environment against raw mj_step, medians of one interleaved run")
     for name in ("worlds", "threads", "env steps/s", "raw steps/s", "ratio"):
         table.add_column(name, justify="right")
     for r in results:
-        table.add_row(
-            str(r.num_envs), str(r.threads), f"{r.env_steps_per_s:,.0f}", f"{r.raw_steps_per_s:,.0f}", f"{r.ratio:.3f}"
-        )
+        rates = f"{r.env_steps_per_s:,.0f}", f"{r.raw_steps_per_s:,.0f}"
+        table.add_row(str(r.num_envs), str(r.threads), *rates, f"{r.ratio:.3f}")
     console.print(table)
-    folder = new_run("speed", {"num_envs": [r.num_envs for r in results]}, None, output)
-    path = folder / "speed.json"
     path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
     return path

@@ -1,0 +1,558 @@
+"""Result folders, comparisons and the command `elastic`: what they write, and how they refuse bad input."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image, ImageSequence
+from rich.console import Console
+
+import baselines
+import train.compare
+import train.demo
+import train.evaluate
+import train.speed
+from baselines.identification import Identification
+from elastic_env.config import load_yaml
+from elastic_env.errors import ResultsExistError
+from elastic_env.signals import Array
+from elastic_env.tasks.testbed import METRICS
+from tests.test_identification import synthetic
+from train.cli import main
+from train.compare import CompareConfig
+from train.evaluate import Condition, Evaluation, PolicySpec, evaluate
+from train.play import play
+from train.runs import new_run
+
+SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
+MULTISINE = {"kind": "multisine", "amplitude": 0.02, "duration_s": 0.1, "onset_s": 0.2}
+HOLD = {
+    "kind": "hold", "positions": 5, "lower": -0.3, "upper": 0.3, "rate": 0.8, "shortest_move_s": 0.3, "settle_s": 0.05,
+    "measure_s": 0.05,
+}  # fmt: skip
+COMMAND_SINE = "{kind: sine, amplitude: 0.05, duration_s: 0.3, onset_s: 0.2}"
+
+
+def condition(policy: str = "input", reference: Any = None, **values: Any) -> Condition:
+    """A short cell of a comparison."""
+    return Condition(policy=PolicySpec(name=policy), reference=reference or SINE, **values)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Contents of all files under a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test works in a folder of its own, on a wide terminal without colours."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Conditions are evaluated in this process: starting others takes seconds."""
+
+    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+        return [evaluate(condition, num_threads=1) for condition in conditions]
+
+    monkeypatch.setattr(train.compare, "run_conditions", run)
+    monkeypatch.setattr(train.demo, "run_conditions", run)
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Error message of a command that must end with exit code 2."""
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    output = capsys.readouterr()
+    assert caught.value.code == 2
+    assert "Traceback" not in output.err
+    return output.err
+
+
+# The result of an evaluation.
+
+
+def test_records_depend_neither_on_threads_nor_on_the_other_episodes() -> None:
+    """Catches seeds that count differently in a batch, and worlds that disturb each other."""
+    multi = {"reference": MULTISINE, "seed": 5, "scenario": "sensor"}
+    together = evaluate(condition(**multi, episodes=3), num_threads=2)
+    single_thread = evaluate(condition(**multi, episodes=3), num_threads=1)
+    alone = [evaluate(condition(**{**multi, "seed": 5 + i}), num_threads=1).episodes[0] for i in range(3)]
+    assert together.episodes == single_thread.episodes == alone
+    assert [episode["seed"] for episode in alone] == [5, 6, 7]
+    assert len({episode["link_error_rms_rad"] for episode in alone}) == 3
+
+
+def test_records_do_not_depend_on_how_episodes_are_batched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches episodes lost or repeated where there are more of them than worlds."""
+    cell = condition(reference=MULTISINE, episodes=5)
+    whole = evaluate(cell, num_threads=1)
+    monkeypatch.setattr(train.evaluate, "_MAX_WORLDS", 2)
+    parts = evaluate(cell, num_threads=1)
+    assert parts.episodes == whole.episodes
+    np.testing.assert_array_equal(parts.trace["link_angle"], whole.trace["link_angle"])
+
+
+def test_record_names_its_cell_and_agrees_with_its_trace() -> None:
+    """Catches metrics of another world or another window, and signals out of step with their time."""
+    result = evaluate(condition("uncompensated", scenario="ideal"), num_threads=1)
+    record, trace = result.episodes[0], result.trace
+    named = {"policy": "uncompensated", "scenario": "ideal", "reference": "sine", "seed": 0, "termination": ""}
+    assert {key: record[key] for key in named} == named
+    scored = trace["time_s"] > 1.2 + 1e-9
+    assert record["link_error_rms_rad"] == pytest.approx(np.sqrt(np.mean(trace["link_error"][scored] ** 2)), rel=1e-12)
+    np.testing.assert_allclose(trace["time_s"], np.arange(376) * 0.004, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(trace["reference_angle"] - trace["link_angle"], trace["link_error"], atol=1e-15)
+
+
+def test_error_of_the_estimate_is_that_of_the_policy() -> None:
+    """Catches an estimate scored at another time than the truth: the error of the encoder is the deflection."""
+    plain = evaluate(condition("uncompensated", scenario="ideal"), num_threads=1)
+    seen = plain.trace["deflection"][plain.trace["time_s"] > 1.2 + 1e-9][:-1]  # no policy sees the last state
+    error = plain.episodes[0]["link_estimate_error_rms_rad"]
+    assert error == pytest.approx(np.sqrt(np.mean(seen**2)), rel=1e-12)
+    oracle = evaluate(condition("oracle", scenario="ideal"), num_threads=1).episodes[0]
+    assert oracle["link_estimate_error_rms_rad"] == 0.0
+
+
+def test_static_points_of_an_evaluation_are_those_of_the_first_world() -> None:
+    """Catches points averaged over worlds or windows, and references in the order of another sweep."""
+    cell = condition("uncompensated", HOLD, scenario="ideal", env_options={"stiffness": 3000.0})
+    one, three = evaluate(cell, num_threads=1), evaluate(cell.replace(episodes=3), num_threads=1)
+    assert one.points is not None
+    assert three.points is not None
+    np.testing.assert_array_equal(one.points.theta, three.points.theta)
+    assert len(one.points) == len(one.rest_references) == 10
+    np.testing.assert_allclose(one.points.theta, one.rest_references, rtol=0.0, atol=0.01)  # on the move
+
+
+class Lazy:
+    """A policy that returns zeros and keeps no state."""
+
+    def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+        """Zero offset."""
+        return np.zeros((*observation.shape[:-1], 1)), state
+
+
+def lazy(env: Any, ignored: int = 0) -> Lazy:
+    """One's own policy, as "module:function"."""
+    return Lazy()
+
+
+def test_ones_own_policy_is_evaluated_like_a_baseline() -> None:
+    """Catches a protocol that asks for more than `predict`: no estimate, no base class, options handed on."""
+    spec = PolicySpec(name=f"{__name__}:lazy", label="mine", options={"ignored": 3})
+    own = evaluate(Condition(policy=spec, reference=SINE), num_threads=1).episodes[0]
+    zero = evaluate(condition("zero"), num_threads=1).episodes[0]
+    assert own["policy"] == "mine"
+    shared = own.keys() - {"policy"}
+    assert {key: own[key] for key in shared} == {key: zero[key] for key in shared}
+    assert "link_estimate_error_rms_rad" not in own
+
+
+def test_the_command_finds_ones_own_policy_in_the_current_folder() -> None:
+    """Catches a console script that looks for modules beside itself, so that nobody's own policy is found."""
+    Path("mine.py").write_text("def make(env):\n    return 'found'\n")
+    command = [str(Path(sys.executable).with_name("elastic")), "evaluate", "--policy", "mine:make"]
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert finished.returncode == 2
+    assert "policy 'mine:make' has no method predict(), got str" in finished.stderr
+
+
+def condition_of(env: Any) -> str:
+    """A function that makes no policy."""
+    return str(env)
+
+
+# Result folders.
+
+
+def test_a_taken_name_gets_the_next_free_number() -> None:
+    """Catches results that overwrite those of the run before."""
+    folders = [new_run("name", {"number": i}, seed=i) for i in range(3)]
+    assert folders == [Path("runs/name"), Path("runs/name-2"), Path("runs/name-3")]
+    assert [yaml.safe_load((folder / "config.yaml").read_text())["number"] for folder in folders] == [0, 1, 2]
+
+
+def test_metadata_says_seed_versions_and_commit() -> None:
+    """Catches results that cannot be made again."""
+    written = json.loads((new_run("name", {}, seed=17) / "metadata.json").read_text())
+    assert written["seed"] == 17
+    assert written["versions"]["mujoco"].count(".") >= 1
+    assert {"elastic-env", "gymnasium", "numpy", "pin", "scipy"} <= written["versions"].keys()
+    assert {"commit", "python", "platform", "created"} <= written.keys()
+
+
+def test_named_output_folder_may_be_new_or_empty(tmp_path: Path) -> None:
+    """Catches a folder that must exist, and one that must not."""
+    (tmp_path / "empty").mkdir()
+    assert new_run("x", {}, 0, tmp_path / "empty") == tmp_path / "empty"
+    assert new_run("x", {}, 0, tmp_path / "deep" / "new") == tmp_path / "deep" / "new"
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_output_that_exists_is_refused(kind: str, tmp_path: Path) -> None:
+    """Catches results written among others, or over a file."""
+    output = tmp_path / "taken"
+    inside = output / "precious.txt" if kind == "folder" else output
+    inside.parent.mkdir(exist_ok=True)
+    inside.write_text("years of work")
+    with pytest.raises(ResultsExistError, match="taken"):
+        new_run("x", {}, 0, output)
+    assert files_of(tmp_path) == {str(inside.relative_to(tmp_path)): b"years of work"}
+
+
+# elastic compare, once with real processes, and elastic evaluate.
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Folder of `elastic compare`, its configuration, and what it printed."""
+
+    folder: Path
+    config: CompareConfig
+    printed: str
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
+    """Two policies, two episodes, in processes of their own."""
+    root = tmp_path_factory.mktemp("compare")
+    content = {
+        "name": "small", "references": [SINE], "scenarios": ["soft"],
+        "policies": ["uncompensated", {"name": "input", "label": "newton", "options": {"output": "newton"}}],
+        "episodes": 2, "seed": 3, "env_options": {"stiffness": 900},
+    }  # fmt: skip
+    (root / "small.yaml").write_text(yaml.safe_dump(content))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        console = Console(width=200, record=True, quiet=False, file=(root / "printed.txt").open("w"))
+        patch.setattr("train.cli._CONSOLE", console)
+        main(["compare", "small.yaml", "--jobs", "2"])
+        console.file.close()
+    return Compared(
+        root / "runs" / "small", load_yaml(root / "small.yaml", CompareConfig), (root / "printed.txt").read_text()
+    )
+
+
+def test_compare_writes_one_row_per_episode_with_every_metric(compared: Compared) -> None:
+    """Catches rows or columns that are lost, and results that depend on running in a process of their own."""
+    rows = rows_of(compared.folder / "episodes.csv")
+    cells = [(row["policy"], row["scenario"], row["reference"], row["seed"]) for row in rows]
+    assert cells == [(policy, "soft", "sine", seed) for policy in ("uncompensated", "newton") for seed in ("3", "4")]
+    assert {metric.name for metric in METRICS} <= rows[0].keys()
+    assert {"termination", "diverged", "link_estimate_error_rms_rad"} <= rows[0].keys()
+    expected = [episode for cell in compared.config.conditions() for episode in evaluate(cell, num_threads=1).episodes]
+    assert rows == [{key: str(value) for key, value in episode.items()} for episode in expected]
+
+
+def test_compare_leaves_configuration_and_origin_beside_its_results(compared: Compared) -> None:
+    """Catches a configuration that is not the resolved one: read again, it must be the same comparison."""
+    assert load_yaml(compared.folder / "config.yaml", CompareConfig) == compared.config
+    assert json.loads((compared.folder / "metadata.json").read_text())["seed"] == 3
+
+
+def test_compare_summarises_every_cell(compared: Compared) -> None:
+    """Catches a median over the wrong episodes: table, Markdown and CSV must say the same."""
+    rows = rows_of(compared.folder / "episodes.csv")
+    lines = (compared.folder / "summary.md").read_text().splitlines()
+    assert len(lines) == 4
+    for policy, line in zip(("uncompensated", "newton"), lines[2:], strict=True):
+        values = [float(row["link_error_rms_rad"]) for row in rows if row["policy"] == policy]
+        median = f"{1e3 * np.median(values):.2f}"
+        assert line.startswith(f"| sine | soft | {policy} | {median} |")
+        assert line.endswith("| 0/2 |")
+        assert any(policy in printed and median in printed for printed in compared.printed.splitlines())
+
+
+def test_compare_draws_figures_that_open_and_names_its_files(compared: Compared) -> None:
+    """Catches empty pictures, and files that the terminal does not tell of."""
+    pictures = sorted(compared.folder.glob("*.png"))
+    assert [path.name for path in pictures] == ["overview.png", "time_sine_soft.png"]
+    for path in pictures:
+        with Image.open(path) as image:
+            image.load()
+            assert image.size[0] > 300
+            assert len(np.unique(np.asarray(image.convert("L")))) > 20
+    for name in ("episodes.csv", "summary.md", "overview.png", "time_sine_soft.png"):
+        assert f"runs/small/{name}" in compared.printed
+
+
+@pytest.mark.usefixtures("in_process")
+def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches results that are overwritten: `elastic evaluate` twice, one after the other."""
+    arguments = ["evaluate", "--policy", "input", "--reference", COMMAND_SINE, "--episodes", "2", "--seed", "6"]
+    main(arguments)
+    first = files_of(Path("runs/evaluate"))
+    main(arguments)
+    assert files_of(Path("runs/evaluate")) == first
+    assert {path.name for path in Path("runs").iterdir()} == {"evaluate", "evaluate-2"}
+    assert Path("runs/evaluate-2/episodes.csv").read_bytes() == first["episodes.csv"]
+    assert [row["seed"] for row in rows_of(Path("runs/evaluate/episodes.csv"))] == ["6", "7"]
+    assert "runs/evaluate-2/episodes.csv" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("in_process")
+def test_evaluate_hands_the_stiffness_of_a_file_to_the_policy() -> None:
+    """Catches an option that is read and forgotten: a policy that believes in 2 K compensates half the deflection."""
+    Path("identification.json").write_text('{"stiffness_nm_per_rad": 2002.0}')
+    reference = "{kind: sine, middle: 0.5, amplitude: 0.005, duration_s: 0.1, onset_s: 0.2}"
+    arguments = ["evaluate", "--reference", reference, "--scenario", "ideal"]
+    for more in (["--stiffness", "identification.json"], ["--stiffness", "2002"], [], ["--policy", "uncompensated"]):
+        main([*arguments, *more])
+    folders = ["evaluate", "evaluate-2", "evaluate-3", "evaluate-4"]
+    rms = [float(rows_of(Path("runs") / f / "episodes.csv")[0]["link_error_rms_rad"]) for f in folders]
+    assert rms[0] == rms[1]
+    assert rms[0] == pytest.approx(0.5 * rms[3], rel=0.05)
+    assert rms[2] < 0.05 * rms[3]
+
+
+@pytest.mark.usefixtures("in_process")
+def test_two_references_of_one_kind_stay_apart() -> None:
+    """Catches the second sine's figure written over the first's, and rows of which nobody can say whose they are."""
+    content = {"name": "two", "references": [SINE, {**SINE, "frequency_hz": 0.5}], "policies": ["zero"]}
+    Path("two.yaml").write_text(yaml.safe_dump(content))
+    main(["compare", "two.yaml"])
+    assert len(list(Path("runs/two").glob("time_*.png"))) == 2
+    assert len({row["reference"] for row in rows_of(Path("runs/two/episodes.csv"))}) == 2
+
+
+@pytest.mark.parametrize("command", ["evaluate", "compare", "identify", "speed"])
+def test_output_that_holds_results_is_refused_before_the_work(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches results that are overwritten, and minutes of work that end in a refusal."""
+    Path("c.yaml").write_text(yaml.safe_dump({"name": "c", "references": [SINE]}))
+    Path("taken").mkdir()
+    Path("taken/notes.txt").write_text("keep me")
+    for name in ("train.compare.run_conditions", "train.identify.identify", "train.speed.measure"):
+        monkeypatch.setattr(name, lambda *_, **__: pytest.fail("the work began"))
+    arguments = {"evaluate": ["--reference", COMMAND_SINE], "compare": ["c.yaml"]}.get(command, [])
+    message = refused([command, *arguments, "--output", "taken"], capsys)
+    assert "taken already holds results (notes.txt" in message
+    assert files_of(Path("taken")) == {"notes.txt": b"keep me"}
+    assert not Path("runs").exists()
+
+
+# Bad input: exit code 2, what is wrong, and what exists.
+
+CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
+    "key": ({"name": "c", "polices": ["input"]}, ["'polices'", "policies", "scenarios", "episodes"]),
+    "policy": ({"name": "c", "policies": ["inptu"]}, ["'inptu'", "input", "dynamic", "oracle"]),
+    "policy key": ({"name": "c", "policies": [{"name": "input", "lable": "x"}]}, ["'lable'", "label", "options"]),
+    "policy option": (
+        {"name": "c", "policies": [{"name": "input", "options": {"stifness": 3}}]},
+        ["'stifness'", "stiffness", "ramp_s"],
+    ),
+    "scenario": ({"name": "c", "scenarios": ["sof"]}, ["'sof'", "soft", "nominal", "backlash"]),
+    "reference": ({"name": "c", "references": ["sin"]}, ["'sin'", "sine", "hold", "steps"]),
+    "reference key": (
+        {"name": "c", "references": [{"kind": "sine", "hz": 1}]}, ["'hz'", "frequency_hz", "amplitude"]
+    ),
+    "environment": ({"name": "c", "env": "tesbed"}, ["'tesbed'", "testbed"]),
+    "environment option": ({"name": "c", "env_options": {"stifness": 3}}, ["'stifness'", "stiffness", "pendulum"]),
+    "no name": ({"policies": ["input"]}, ["name"]),
+    "no policies": ({"name": "c", "policies": []}, ["policies"]),
+    "no references": ({"name": "c", "references": []}, ["references"]),
+    "no scenarios": ({"name": "c", "scenarios": []}, ["scenarios"]),
+    "negative": ({"name": "c", "episodes": -1}, ["episodes", ">= 1", "-1"]),
+    "stiffness": ({"name": "c", "env_options": {"stiffness": -3}}, ["stiffness", "> 0", "[N·m/rad]", "-3"]),
+    "no mapping": (["input"], ["mapping", "list"]),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("in_process")
+@pytest.mark.parametrize("case", CONFIGURATIONS)
+def test_wrong_configuration_says_what_and_which_choices(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a key or a name that is ignored, a traceback, and a result folder left behind."""
+    content, words = CONFIGURATIONS[case]
+    Path("c.yaml").write_text(yaml.safe_dump(content))
+    message = refused(["compare", "c.yaml"], capsys)
+    assert [word for word in words if word not in message] == []
+    assert not Path("runs").exists()
+
+
+COMMANDS: dict[str, tuple[list[str], list[str]]] = {
+    "policy": (["evaluate", "--policy", "inptu"], ["'inptu'", "uncompensated", "input", "dynamic", "oracle"]),
+    "module": (["evaluate", "--policy", "nowhere:f"], ["nowhere", "input", "module:function"]),
+    "function": (["evaluate", "--policy", "math:nothing"], ["nothing", "input", "module:function"]),
+    "no policy": (["evaluate", "--policy", f"{__name__}:condition_of"], ["condition_of", "predict()"]),
+    "scenario": (["evaluate", "--scenario", "sof"], ["'sof'", "ideal", "nominal", "soft", "payload", "sensor"]),
+    "ground": (["evaluate", "--scenario", "soft+ideal"], ["'ideal'", "first"]),
+    "reference": (["evaluate", "--reference", "sin"], ["'sin'", "hold", "sine", "multisine", "steps"]),
+    "reference key": (["evaluate", "--reference", "{kind: sine, hz: 3}"], ["'hz'", "frequency_hz"]),
+    "reference text": (["evaluate", "--reference", "{kind: sine"], ["{kind: sine"]),
+    "unit": (["evaluate", "--reference", "{kind: sine, amplitude: -1}"], ["amplitude", "> 0", "[rad]", "-1"]),
+    "infeasible": (["evaluate", "--reference", "{kind: sine, frequency_hz: 9}"], ["84.0 N·m", "amplitude"]),
+    "environment": (["evaluate", "--env", "walker"], ["'walker'", "testbed"]),
+    "episodes": (["evaluate", "--episodes", "0"], ["episodes", ">= 1"]),
+    "seed": (["evaluate", "--seed", "-1"], ["seed", ">= 0", "-1"]),
+    "assumed": (["evaluate", "--stiffness", "-5"], ["stiffness", "> 0", "[N·m/rad]", "-5"]),
+    "assumed file": (["evaluate", "--stiffness", "none.json"], ["none.json"]),
+    "missing file": (["compare", "none.yaml"], ["none.yaml"]),
+    "brackets": (["compare", "[/bold].yaml"], ["[/bold].yaml"]),
+    "jobs": (["compare", "good.yaml", "--jobs", "-1"], ["jobs", "-1"]),
+    "identify scenario": (["identify", "--scenario", "sof"], ["'sof'", "soft"]),
+    "identify seed": (["identify", "--seed", "-1"], ["seed", "-1"]),
+    "identify K": (["identify", "--stiffness", "-1"], ["stiffness", "> 0", "[N·m/rad]"]),
+    "identify positions": (["identify", "--positions", "4"], ["positions", ">= 5", "4"]),
+    "identify masses": (["identify", "--second-mass", "0"], ["mass", "> 0"]),
+    "identify equal masses": (["identify", "--second-mass", "1"], ["mass"]),
+    "play scenario": (["play", "--scenario", "sof", "--video", "x.gif"], ["'sof'", "soft"]),
+    "play environment": (["play", "--env", "walker", "--video", "x.gif"], ["'walker'", "testbed"]),
+    "play format": (["play", "--video", "x.txt", "--max-s", "0.1"], [".mp4", ".gif", "x.txt"]),
+    "play time": (["play", "--video", "x.gif", "--max-s", "-1"], ["max", "-1"]),
+    "speed worlds": (["speed", "--num-envs", "0"], ["num_envs", "0"]),
+    "speed steps": (["speed", "--num-envs", "2", "--steps", "0"], ["steps", "0"]),
+    "speed rounds": (["speed", "--num-envs", "2", "--steps", "1", "--rounds", "0"], ["rounds", "0"]),
+}
+
+
+@pytest.mark.parametrize("case", COMMANDS)
+def test_wrong_argument_says_what_and_which_choices(
+    case: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches tracebacks, units that vanish as markup, names that are not listed, and folders left behind."""
+    arguments, words = COMMANDS[case]
+    monkeypatch.setattr("train.identify.identify", lambda *_, **__: pytest.fail("the work began"))
+    Path("good.yaml").write_text(yaml.safe_dump({"name": "c", "references": [SINE]}))
+    message = refused(arguments, capsys)
+    assert [word for word in words if word not in message] == []
+    assert not Path("runs").exists()
+    assert not list(Path().glob("x.*"))
+
+
+def test_missing_file_names_those_beside_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a message that leaves the user to search."""
+    Path("configs").mkdir()
+    Path("configs/testbed.yaml").write_text("name: t")
+    assert "configs/testbed.yaml" in refused(["compare", "configs/tesbed.yaml"], capsys)
+
+
+def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a traceback of the YAML parser."""
+    Path("c.yaml").write_text("name: [unclosed")
+    assert "c.yaml is not valid YAML" in refused(["compare", "c.yaml"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--help"], ["identify", "evaluate", "compare", "speed", "play"]),
+        (["evaluate", "--help"], ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"]),
+        (["compare", "--help"], ["configs/", "episodes.csv", "--jobs"]),
+        (["identify", "--help"], ["--second-mass", "N·m/rad", "identification.json"]),
+    ],
+)
+def test_help_teaches(arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a command or an option without explanation."""
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    printed = capsys.readouterr().out
+    assert caught.value.code == 0
+    assert [word for word in words if word not in printed] == []
+
+
+# elastic identify, speed, play, demo.
+
+
+def test_identify_writes_result_and_figure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a result that is printed and not written, and a second mass that is not used."""
+    masses = []
+
+    def record(env: Any, seed: int | None = None, progress: Any = None) -> list[Any]:
+        progress(1.0)
+        mass = env.unwrapped.task.config.pendulum.gravity_torque / 60.0
+        masses.append(mass)
+        return [synthetic(K=888.0, F=5.4, masses=(mass,))]
+
+    monkeypatch.setattr("baselines.identification.record_points", record)
+    main(["identify", "--second-mass", "0.5", "--output", "result"])
+    assert masses == [1.0, 0.5]
+    result = Identification.load(Path("result/identification.json"))
+    assert result.stiffness_nm_per_rad == pytest.approx(888.0, rel=1e-6)
+    assert result.imu_sine_error_rad == pytest.approx(0.0, abs=1e-9)
+    with Image.open("result/identification.png") as image:
+        image.load()
+    assert json.loads(Path("result/metadata.json").read_text())["seed"] == 0
+    printed = capsys.readouterr().out
+    assert [text for text in ("888.0", "5.40", "hysteresis", "result/identification.json") if text not in printed] == []
+
+
+def test_speed_writes_every_size_that_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a size that is measured and not reported, and threads that are not those asked for."""
+    main(["speed", "--num-envs", "4", "2", "--steps", "5", "--rounds", "2", "--threads", "1"])
+    results = json.loads(Path("runs/speed/speed.json").read_text())
+    assert [(r["num_envs"], r["threads"]) for r in results] == [(4, 1), (2, 1)]
+    for result in results:
+        assert min(result["env_steps_per_s"], result["raw_steps_per_s"], result["ratio"]) > 0.0
+    assert "runs/speed/speed.json" in capsys.readouterr().out
+
+
+def test_raw_stepping_does_the_work_of_the_environment() -> None:
+    """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
+    env = train.evaluate.make_vector_env(condition(scenario="ideal"), 3, num_threads=1)
+    env.reset(seed=0)
+    inside = env.unwrapped
+    raw = train.speed._RawWorlds(inside.task, inside.simulation, threads=2)
+    controls = np.empty((300, *inside.simulation.ctrl.shape))
+    for step in range(300):
+        env.step(np.full((3, 1), 0.01, dtype=np.float32))
+        controls[step] = inside.simulation.ctrl
+    raw.run(controls)
+    worlds = sorted((world for share in raw._shares for world in share), key=lambda pair: pair[0])
+    np.testing.assert_array_equal([data.qpos for _, data in worlds], inside.simulation.qpos)
+
+
+def test_play_films_the_episode_and_keeps_an_existing_film(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a film of the wrong length or of nothing, and one that is overwritten."""
+    main(["play", "--policy", "input", "--reference", "sine", "--video", "x.gif", "--max-s", "0.2"])
+    with Image.open("x.gif") as film:
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+        assert film.info["duration"] == 40  # 25 frames a second [ms]
+    assert [frame.shape for frame in frames] == [(480, 640, 3)] * 5
+    assert np.any(frames[0] != frames[-1])  # the clock at least
+    before = Path("x.gif").read_bytes()
+    assert "x.gif exists" in refused(["play", "--video", "x.gif", "--max-s", "0.1"], capsys)
+    assert Path("x.gif").read_bytes() == before
+
+
+def test_play_writes_mp4() -> None:
+    """Catches a writer that takes one format alone."""
+    play(condition(), Console(quiet=True), Path("deep/x.mp4"), max_s=0.1)
+    assert Path("deep/x.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+@pytest.mark.usefixtures("in_process")
+def test_demo_prints_its_table_and_the_paths_of_its_figures(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a demonstration that breaks on the way; with short references, so that it takes seconds."""
+    monkeypatch.setattr(train.demo, "_STATIC", train.demo._STATIC.replace(references=[HOLD]))
+    monkeypatch.setattr(train.demo, "_MOTION", train.demo._MOTION.replace(references=[SINE]))
+    main(["demo"])
+    printed = capsys.readouterr().out
+    names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json"}
+    assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}
+    assert [name for name in names if f"runs/demo/{name}" not in printed] == []
+    assert [
+        text for text in ("Pearson r", "0.9775", "-56.2 to +41.7", *baselines.policy_names()[1:]) if text not in printed
+    ] == []
