@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from train.play import play
 from train.runs import new_run
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
-MULTISINE = {"kind": "multisine", "amplitude": 0.02, "duration_s": 0.1, "onset_s": 0.2}
+MULTISINE = {"kind": "multisine", "amplitude": 0.05, "middle": 0.2, "duration_s": 0.2, "onset_s": 0.3}
 HOLD = {
     "kind": "hold", "positions": 5, "lower": -0.3, "upper": 0.3, "rate": 0.8, "shortest_move_s": 0.3, "settle_s": 0.05,
     "measure_s": 0.05,
@@ -143,22 +144,25 @@ def test_static_points_of_an_evaluation_are_those_of_the_first_world() -> None:
     np.testing.assert_allclose(one.points.theta, one.rest_references, rtol=0.0, atol=0.01)  # on the move
 
 
-class Lazy:
-    """A policy that returns zeros and keeps no state."""
+class Constant:
+    """A policy that returns the same offset always and keeps no state."""
+
+    def __init__(self, offset: float) -> None:
+        self._offset = offset
 
     def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
-        """Zero offset."""
-        return np.zeros((*observation.shape[:-1], 1)), state
+        """The offset, for every world."""
+        return np.full((*observation.shape[:-1], 1), self._offset), state
 
 
-def lazy(env: Any, ignored: int = 0) -> Lazy:
+def constant(env: Any, offset: float = 0.1) -> Constant:
     """One's own policy, as "module:function"."""
-    return Lazy()
+    return Constant(offset)
 
 
 def test_ones_own_policy_is_evaluated_like_a_baseline() -> None:
     """Catches a protocol that asks for more than `predict`: no estimate, no base class, options handed on."""
-    spec = PolicySpec(name=f"{__name__}:lazy", label="mine", options={"ignored": 3})
+    spec = PolicySpec(name=f"{__name__}:constant", label="mine", options={"offset": 0.0})
     own = evaluate(Condition(policy=spec, reference=SINE), num_threads=1).episodes[0]
     zero = evaluate(condition("zero"), num_threads=1).episodes[0]
     assert own["policy"] == "mine"
@@ -237,7 +241,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     """Two policies, two episodes, in processes of their own."""
     root = tmp_path_factory.mktemp("compare")
     content = {
-        "name": "small", "references": [SINE], "scenarios": ["soft"],
+        "name": "small", "references": [MULTISINE], "scenarios": ["soft"],
         "policies": ["uncompensated", {"name": "input", "label": "newton", "options": {"output": "newton"}}],
         "episodes": 2, "seed": 3, "env_options": {"stiffness": 900},
     }  # fmt: skip
@@ -257,7 +261,9 @@ def test_compare_writes_one_row_per_episode_with_every_metric(compared: Compared
     """Catches rows or columns that are lost, and results that depend on running in a process of their own."""
     rows = rows_of(compared.folder / "episodes.csv")
     cells = [(row["policy"], row["scenario"], row["reference"], row["seed"]) for row in rows]
-    assert cells == [(policy, "soft", "sine", seed) for policy in ("uncompensated", "newton") for seed in ("3", "4")]
+    assert cells == [
+        (policy, "soft", "multisine", seed) for policy in ("uncompensated", "newton") for seed in ("3", "4")
+    ]
     assert {metric.name for metric in METRICS} <= rows[0].keys()
     assert {"termination", "diverged", "link_estimate_error_rms_rad"} <= rows[0].keys()
     expected = [episode for cell in compared.config.conditions() for episode in evaluate(cell, num_threads=1).episodes]
@@ -278,7 +284,8 @@ def test_compare_summarises_every_cell(compared: Compared) -> None:
     for policy, line in zip(("uncompensated", "newton"), lines[2:], strict=True):
         values = [float(row["link_error_rms_rad"]) for row in rows if row["policy"] == policy]
         median = f"{1e3 * np.median(values):.2f}"
-        assert line.startswith(f"| sine | soft | {policy} | {median} |")
+        assert median not in [f"{1e3 * value:.2f}" for value in values]
+        assert line.startswith(f"| multisine | soft | {policy} | {median} |")
         assert line.endswith("| 0/2 |")
         assert any(policy in printed and median in printed for printed in compared.printed.splitlines())
 
@@ -286,14 +293,28 @@ def test_compare_summarises_every_cell(compared: Compared) -> None:
 def test_compare_draws_figures_that_open_and_names_its_files(compared: Compared) -> None:
     """Catches empty pictures, and files that the terminal does not tell of."""
     pictures = sorted(compared.folder.glob("*.png"))
-    assert [path.name for path in pictures] == ["overview.png", "time_sine_soft.png"]
+    assert [path.name for path in pictures] == ["overview.png", "time_multisine_soft.png"]
     for path in pictures:
         with Image.open(path) as image:
             image.load()
             assert image.size[0] > 300
             assert len(np.unique(np.asarray(image.convert("L")))) > 20
-    for name in ("episodes.csv", "summary.md", "overview.png", "time_sine_soft.png"):
+    for name in ("episodes.csv", "summary.md", "overview.png", "time_multisine_soft.png"):
         assert f"runs/small/{name}" in compared.printed
+
+
+def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
+    """Catches a fall that spoils, or improves, the median of the episodes that stayed up."""
+    names = ("link_error_rms_rad", "link_error_peak_rad")
+    episodes = [
+        {"termination": reason, **dict.fromkeys(names, value)}
+        for reason, value in (("", 0.001), ("diverged", 9.0), ("", 0.003), ("diverged", float("nan")))
+    ]
+    table = Console(width=160, record=True, file=StringIO())
+    table.print(train.compare.summary_table([Evaluation(condition(), episodes)]))
+    row = next(line for line in table.export_text().splitlines() if "input" in line)
+    assert "2.00" in row
+    assert "2/4" in row
 
 
 @pytest.mark.usefixtures("in_process")
@@ -509,7 +530,8 @@ def test_speed_writes_every_size_that_it_measures(capsys: pytest.CaptureFixture[
 
 def test_raw_stepping_does_the_work_of_the_environment() -> None:
     """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
-    env = train.evaluate.make_vector_env(condition(scenario="ideal"), 3, num_threads=1)
+    reference = {"kind": "sine", "middle": 0.5, "amplitude": 0.005, "duration_s": 0.1, "onset_s": 0.2}
+    env = train.evaluate.make_vector_env(condition(reference=reference), 3, num_threads=1)
     env.reset(seed=0)
     inside = env.unwrapped
     raw = train.speed._RawWorlds(inside.task, inside.simulation, threads=2)

@@ -151,7 +151,7 @@ def summary_table(evaluations: Sequence[Evaluation]) -> Table:
         table.add_column(name, no_wrap=True)
     for title, _ in _SUMMARY:
         table.add_column(title, justify="right", no_wrap=True)
-    table.add_column("failed", justify="right", no_wrap=True)
+    table.add_column("fail", justify="right", no_wrap=True)
     previous = None
     for evaluation in evaluations:
         cell = evaluation.condition.reference_name, evaluation.condition.scenario
