@@ -29,7 +29,7 @@ HYSTERESIS_RESOLUTION_RAD = 1e-4
 
 _SIGN_ITERATIONS = 5
 _ANGLE_ITERATIONS = 12  # each gains a digit: the error shrinks by about τ_g′/K
-_SINGULAR = 1e-9  # smallest singular value, relative, of a design that tells its columns apart
+_SINGULAR = 1e-2  # smallest singular value, relative, of unit columns that are told apart beyond their noise
 _RESAMPLES = 999
 
 
@@ -182,15 +182,21 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
         )
     rows = [np.flatnonzero(points.position == position) for position in positions]
 
+    generator = np.random.default_rng(seed)
+
     def statistics(chosen: IntArray) -> tuple[float, float]:
-        visits = np.concatenate([rows[i] for i in chosen])
-        resampled = fit_points(points.rows(visits), q[visits], torque[visits], with_sine_error)
-        return resampled.stiffness, resampled.friction
+        while True:
+            visits = np.concatenate([rows[i] for i in chosen])
+            resampled = fit_points(points.rows(visits), q[visits], torque[visits], with_sine_error)
+            if resampled.is_determined:
+                return resampled.stiffness, resampled.friction
+            # one position over and over determines nothing: draw again
+            chosen = generator.integers(len(rows), size=len(rows))
 
     interval = stats.bootstrap(
         (np.arange(len(positions)),), statistics, n_resamples=_RESAMPLES, vectorized=False, method="percentile",
         confidence_level=_expanded_level(len(positions)),
-        rng=np.random.default_rng(seed),
+        rng=generator,
     ).confidence_interval  # fmt: skip
     line: Any = stats.linregress(torque, points.theta - points.q)
     return Identification(

@@ -236,8 +236,8 @@ def test_three_masses_are_refused() -> None:
 # From here on the simulated testbed: one rollout each, shared by the tests, as many at a time as there are cores.
 
 NARROW = {"kind": "hold", "positions": 5, "lower": -0.6, "upper": 0.5, "rate": 0.2, "shortest_move_s": 3.0}
-WIDE = {"kind": "hold", "positions": 7, "settle_s": 1.0, "measure_s": 0.4}
-ENDS = {"kind": "hold", "positions": 2, "lower": -0.4, "upper": 0.4}  # compensated, the error is the same all over
+WIDE = {"kind": "hold", "positions": 7, "rate": 0.1, "settle_s": 1.0, "measure_s": 0.4}
+ENDS = {**WIDE, "positions": 2, "lower": -0.4, "upper": 0.4}  # compensated, the error is the same all over
 RUNS: dict[str, dict[str, Any]] = {
     "nominal": {"reference": WIDE, "scenario": "nominal"},
     "backlash": {"reference": WIDE, "scenario": "backlash"},

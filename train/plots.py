@@ -115,7 +115,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
         if points is None:
             continue
         error = _MRAD * static_errors(evaluation)
-        marker, face = ("x", None) if index == 0 else ("o", "none")
+        marker, face = "xosDv^"[index % 6], None if index == 0 else "none"
         style = {"facecolors": face, "edgecolors": colour(policy, index)} if face else {"color": colour(policy, index)}
         low, high = error.min(), error.max()
         axis.scatter(
