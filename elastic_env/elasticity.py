@@ -168,13 +168,14 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
         ElasticError: K + ∂τ_g/∂q is singular: gravity balances the spring and no deflection is stable.
     """
     n = stiffness.shape[-1]
-    total = torque_gradient + stiffness[..., None] * np.eye(n)
     # every row by its own stiffness: the size of K says nothing about singularity
-    if np.any(np.abs(np.linalg.det(total / stiffness[..., None])) < np.finfo(np.float64).eps):
+    relative = torque_gradient / stiffness[..., None] + np.eye(n)
+    determinant = relative[..., 0, 0] if n == 1 else np.linalg.det(relative)
+    if (np.abs(determinant) < np.finfo(np.float64).eps).any():
         raise ElasticError(
             "K + ∂τ_g/∂q is singular: gravity cancels the stiffness "
             f"(smallest K {stiffness.min():.6g} N·m/rad); a stiffer joint or a lighter load is needed"
         )
     if n == 1:
-        return torque / total[..., 0]
-    return np.linalg.solve(total, torque[..., None])[..., 0]
+        return torque / stiffness / determinant[..., None]
+    return np.linalg.solve(relative, (torque / stiffness)[..., None])[..., 0]

@@ -30,6 +30,7 @@ class RigidBody:
         self._model = _convert(model)
         self._data = self._model.createData()
         self._columns = np.array([self._model.joints[self._model.getJointId(joint)].idx_v for joint in joints])
+        self._square = np.ix_(self._columns, self._columns)
         self._zero = np.array([model.qpos0[model.joint(joint).qposadr[0]] for joint in joints])
 
     def gravity_torque(self, q: Array) -> Array:
@@ -43,7 +44,7 @@ class RigidBody:
         gradient = np.empty((len(rows), n, n))
         for i, row in enumerate(rows):
             full = pinocchio.computeGeneralizedGravityDerivatives(self._model, self._data, self._full(row))
-            gradient[i] = full[np.ix_(self._columns, self._columns)]
+            gradient[i] = full[self._square]
         return gradient.reshape(*q.shape, n)
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
