@@ -20,8 +20,8 @@ class Compensated:
     Args:
         policy: Anything with `predict`; its state may be anything.
         compensator: Where the motor has to lead, and where the link is.
-        table: Observation table of the environment, `env.unwrapped.task.observation_table`.
-        control_period_s: Time between observations.
+        table: Observation table of the environment; None for that of the compensator's model.
+        control_period_s: Time between observations; None for that of the compensator's model.
         ramp_s: Duration of the ramp.
     """
 
@@ -29,12 +29,14 @@ class Compensated:
         self,
         policy: Policy,
         compensator: Compensator,
-        table: SignalTable,
-        control_period_s: float = 0.004,
+        table: SignalTable | None = None,
+        control_period_s: float | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
         self.policy, self.compensator = policy, compensator
-        self._view = ObservationView(table)
+        model = compensator.model
+        self._view = ObservationView(model.observation_table if table is None else table)
+        control_period_s = model.control_period_s if control_period_s is None else control_period_s
         self._ramp_steps = max(round(ramp_s / control_period_s), 1)
 
     def predict(
@@ -45,7 +47,7 @@ class Compensated:
         Raises:
             ElasticError: Called in the middle of an episode without the state of the last call.
         """
-        rows = np.atleast_2d(observation)
+        rows = self._view.rows(observation)
         desired = self._view.motion(rows)
         memory, inner_state = resume(
             state, episode_start, rows, self._view, lambda: np.pad(self.compensator.begin(desired), ((0, 0), (1, 0)))
@@ -61,7 +63,7 @@ class Compensated:
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Estimated link angle for an observation and the state that `predict` returned for it, (..., n) [rad]."""
         memory, _ = state
-        theta = self._view.theta(np.atleast_2d(observation))
+        theta = self._view.theta(self._view.rows(observation))
         estimate = self.compensator.link_angle(theta, memory[:, 1:])
         return estimate.reshape((*observation.shape[:-1], estimate.shape[-1]))
 

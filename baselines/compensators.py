@@ -73,6 +73,7 @@ class Compensator(Protocol):
     `memory` has one row per world and `memory_width` columns; a compensator without memory has none.
     """
 
+    model: RobotModel
     memory_width: int
 
     def begin(self, motion: Motion) -> Array:
@@ -109,6 +110,7 @@ class GravityCompensator:
     def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod = "pinocchio") -> None:
         if output not in get_args(OutputMethod):
             raise unknown_name("output compensator", output, get_args(OutputMethod))
+        self.model = model
         self.stiffness = model.stiffness
         self.gravity = make_gravity(model, method)
         self._solve = taylor_link_angle if output == "taylor" else newton_link_angle
@@ -158,6 +160,7 @@ class DynamicCompensator:
         method: GravityMethod = "pinocchio",
         friction: bool = False,
     ) -> None:
+        self.model = model
         self._static = GravityCompensator(model, output, method)
         self._body = RigidBody(model.rigid, model.joint_names)
         self._n, self._dt = len(model.joint_names), model.control_period_s

@@ -6,6 +6,7 @@ import numpy as np
 
 from baselines.compensators import DynamicCompensator
 from baselines.policy import Action, ObservationView, resume
+from elastic_env.errors import ElasticError
 from elastic_env.plan import STAND_S, quintic
 from elastic_env.signals import Array
 
@@ -42,7 +43,12 @@ class Oracle:
         deterministic: bool = True,  # noqa: ARG002  the interface's
     ) -> tuple[Action, Any]:
         """Action and new state; the observation must be the environment's present one."""
-        rows = np.atleast_2d(observation)
+        rows = self._view.rows(observation)
+        if not np.array_equal(rows, np.atleast_2d(self._env.task.observe())):
+            raise ElasticError(
+                "the oracle reads the truth of the environment that it was made for, and this is not its present "
+                'observation; make one with baselines.make("oracle", env) for the environment that it is to run in'
+            )
         motion = self._view.motion(rows)
         n = motion.q.shape[-1]
         memory, _ = resume(

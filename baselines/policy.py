@@ -52,6 +52,7 @@ class ObservationView:
     """Where an observation table holds what compensators need, by name."""
 
     def __init__(self, table: SignalTable) -> None:
+        self._width = len(table)
         self._theta, self._theta_dot = table.columns("encoder_angle"), table.columns("encoder_rate")
         self._q, self._q_dot = table.columns("reference_angle"), table.columns("reference_rate")
         self._q_ddot, self._command = table.columns("reference_acceleration"), table.columns("last_command")
@@ -73,6 +74,20 @@ class ObservationView:
         seen = rows.copy()
         seen[:, self._theta], seen[:, self._theta_dot] = q, q_dot
         return seen
+
+    def rows(self, observation: Array) -> Array:
+        """The observation with one row per world, (num_worlds, m).
+
+        Raises:
+            ElasticError: It does not have the columns of the table.
+        """
+        rows = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+        if rows.ndim != 2 or rows.shape[1] != self._width:
+            raise ElasticError(
+                f"an observation must have the {self._width} columns of its table, one row per world, got shape "
+                f"{np.shape(observation)}"
+            )
+        return rows
 
     def is_start(self, rows: Array) -> BoolArray:
         """Whether an observation can be the first of an episode: standing, and nothing commanded yet."""

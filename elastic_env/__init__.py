@@ -6,8 +6,11 @@ env = gymnasium.make("elastic_env/Testbed-v0", scenario="nominal")
 
 import gymnasium
 
+from elastic_env.headless import prefer_egl
+
 __version__ = "0.1.0"
 
+prefer_egl()
 gymnasium.register(
     id="elastic_env/Testbed-v0",
     entry_point="elastic_env.entry_points:make_testbed",

@@ -77,13 +77,15 @@ def _bounds(model: type[BaseModel], name: str) -> str:
         for key, sign in signs.items()
         if hasattr(constraint, key)
     ]
-    return f"a finite number {' and '.join(constraints)}" if constraints else ""
+    whole = field is not None and "int" in str(field.annotation) and "float" not in str(field.annotation)
+    kind = "a whole number" if whole else "a finite number"
+    return f"{kind} {' and '.join(constraints)}" if constraints else ""
 
 
 def _unit(model: type[BaseModel], name: str) -> str:
     field = model.model_fields.get(name)
     extra = field.json_schema_extra if field is not None else None
-    return f" [{extra['unit']}]" if isinstance(extra, dict) else ""
+    return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""
 
 
 def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:

@@ -42,6 +42,9 @@ def configure_testbed(
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
+    for name, given in (("joint", joint), ("pendulum", pendulum)):
+        if not isinstance(given, dict | ElasticJoint | Pendulum | None):
+            raise ConfigurationError(f"{name} must be a model or a mapping of parameters, got {given!r}")
     chosen = joint if isinstance(joint, ElasticJoint) else H54_200_S500_R.replace(**(joint or {}))
     if stiffness is not None:
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
@@ -71,8 +74,10 @@ def make_testbed_vector(
     """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
     if render_mode is not None:
         raise ConfigurationError(f"the vector environment does not render, got render_mode {render_mode!r}; use None")
-    if num_envs < 1:
-        raise ConfigurationError(f"num_envs must be at least 1, got {num_envs}")
+    if not isinstance(num_envs, int) or num_envs < 1:
+        raise ConfigurationError(f"num_envs must be a whole number >= 1, got {num_envs!r}")
+    if num_threads < 0:
+        raise ConfigurationError(f"num_threads must be >= 0, 0 for all cores, got {num_threads}")
     return ElasticVectorEnv(TestbedTask(_configure(arguments), num_envs), num_threads, autoreset_mode)
 
 

@@ -5,6 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
+from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array, BoolArray, IntArray
 
 STAND_S = 1.0
@@ -101,6 +102,11 @@ class PlanTable:
         self._reference, self._period = reference, control_period_s
         probe = self._reference.plan(np.random.default_rng(0), self._period)
         self.num_steps = probe.num_steps
+        if not probe.scored.any():
+            raise ConfigurationError(
+                f"the reference has no scored control step: its scored time is below the control period "
+                f"of {control_period_s} s; lengthen it"
+            )
         self._is_shared = not reference.is_random
         self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
         rows = 1 if self._is_shared else num_worlds

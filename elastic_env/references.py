@@ -36,16 +36,16 @@ class Hold(Model):
     """
 
     kind: Literal["hold"] = "hold"
-    positions: int = quantity("1", 20, ge=2, description="number of static positions")
+    positions: int = quantity("1", 20, ge=2, le=1000, description="number of static positions")
     lower: float = quantity(
         "1", -0.875, gt=-1, lt=1, description="first position, share of the torque at the horizontal"
     )
     upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
     rate: float = quantity("rad/s", 0.06, gt=0, description="peak rate of the moves")
     sag: float = quantity("rad", 60 / 1001, ge=0, description="deflection at the horizontal without compensation")
-    shortest_move_s: float = quantity("s", 4.0, gt=0, description="duration of short moves, which ring less if slow")
-    settle_s: float = quantity("s", 1.5, ge=0, description="time at rest before the measurement")
-    measure_s: float = quantity("s", 0.5, gt=0, description="time of the measurement")
+    shortest_move_s: float = quantity("s", 4.0, gt=0, le=3600, description="shortest move; quick ones ring")
+    settle_s: float = quantity("s", 1.5, ge=0, le=3600, description="time at rest before the measurement")
+    measure_s: float = quantity("s", 0.5, gt=0, le=3600, description="time of the measurement")
     overrun: float = quantity("rad", 0.08, gt=0, description="how far the sweep starts and turns outside the positions")
 
     @model_validator(mode="after")
@@ -119,8 +119,8 @@ class _Oscillation(Model):
 
     amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
     middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="angle about which it oscillates")
-    duration_s: float = quantity("s", 12.0, gt=0, description="scored time")
-    onset_s: float = quantity("s", 2.0, gt=0, description="time in which the amplitude grows; not scored")
+    duration_s: float = quantity("s", 12.0, gt=0, le=3600, description="scored time")
+    onset_s: float = quantity("s", 2.0, gt=0, le=3600, description="time in which the amplitude grows; not scored")
 
     def _enveloped(self, t: Array, x: Array, x_dot: Array, x_ddot: Array) -> Plan:
         w, w_dot, w_ddot = quintic((t - STAND_S) / self.onset_s)
@@ -220,9 +220,9 @@ class Steps(Model):
     kind: Literal["steps"] = "steps"
     amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
     middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="middle of the levels")
-    move_s: float = quantity("s", 1.0, gt=0, description="duration of a move")
-    rest_s: float = quantity("s", 1.0, ge=0, description="rest after a move")
-    moves: int = quantity("1", 5, ge=1, description="number of moves")
+    move_s: float = quantity("s", 1.0, gt=0, le=3600, description="duration of a move")
+    rest_s: float = quantity("s", 1.0, ge=0, le=3600, description="rest after a move")
+    moves: int = quantity("1", 5, ge=1, le=1000, description="number of moves")
     seed: int | None = quantity("1", None, ge=0, description="seed of the levels; None draws new ones per episode")
 
     @property

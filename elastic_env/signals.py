@@ -63,3 +63,7 @@ class SignalTable:
         """The table as a reader wants it: column, name, unit, meaning."""
         rows = [f"| {i} | `{s.name}` | {s.unit} | {s.meaning} |" for i, s in enumerate(self.signals)]
         return "\n".join(["| column | name | unit | meaning |", "|---|---|---|---|", *rows])
+
+
+NO_SIGNALS = SignalTable(())
+"""The table of an observation that holds nothing."""

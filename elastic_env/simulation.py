@@ -4,7 +4,7 @@ Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control
 """
 
 import os
-from typing import Protocol
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -46,6 +46,11 @@ class SingleWorld:
         self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
         self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SingleWorld":
+        copied = SingleWorld(self.model)
+        mujoco.mj_copyData(copied._data, self.model, self._data)
+        return copied
+
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""
         mujoco.mj_step(self.model, self._data, num_substeps)
@@ -69,6 +74,12 @@ class ManyWorlds:
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=min(num_threads or os.cpu_count() or 1, num_worlds))
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ManyWorlds":
+        copied = ManyWorlds(self.model, self.num_worlds, self._batch.nthread)
+        copied._batch.state[:] = self._batch.state
+        copied._batch.warning[:] = self._batch.warning
+        return copied
 
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""

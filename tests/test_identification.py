@@ -125,15 +125,15 @@ def test_interval_covers_the_truth_as_often_as_it_says(monkeypatch: pytest.Monke
     """Catches an interval that resamples visits, whose noise is shared within a position, or that is half as wide."""
     monkeypatch.setattr(identification, "_RESAMPLES", 99)
     generator, hits, widths, estimates = np.random.default_rng(1), 0, [], []
-    for seed in range(150):
+    for seed in range(100):
         up = generator.normal(0.0, 1e-4, 40)
         result = identify_points(synthetic(F=5.4, positions=40, noise=np.r_[up, up[::-1]]), gravity(), seed)
         hits += result.stiffness_low_nm_per_rad <= 1001.0 <= result.stiffness_high_nm_per_rad
         widths.append(result.half_width * result.stiffness_nm_per_rad)
         estimates.append(result.stiffness_nm_per_rad)
-    assert 0.91 <= hits / 150 <= 0.99
+    assert 0.91 <= hits / 100 <= 0.99
     assert np.mean(widths) == REST(1.96 * np.std(estimates), rel=0.15)
-    assert np.mean(estimates) == REST(1001.0, abs=3.0 * np.std(estimates) / np.sqrt(150))
+    assert np.mean(estimates) == REST(1001.0, abs=3.0 * np.std(estimates) / np.sqrt(100))
 
 
 def test_residual_spread_is_that_of_the_noise() -> None:

@@ -3,8 +3,10 @@
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import StringIO
@@ -24,7 +26,7 @@ import train.evaluate
 import train.speed
 from baselines.identification import Identification
 from elastic_env.config import load_yaml
-from elastic_env.errors import ResultsExistError
+from elastic_env.errors import ConfigurationError, ResultsExistError
 from elastic_env.signals import Array
 from elastic_env.tasks.testbed import METRICS
 from tests.test_identification import synthetic
@@ -32,7 +34,7 @@ from train.cli import main
 from train.compare import CompareConfig
 from train.evaluate import Condition, Evaluation, PolicySpec, evaluate
 from train.play import play
-from train.runs import new_run
+from train.runs import new_run, run_folder
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
 MULTISINE = {"kind": "multisine", "amplitude": 0.05, "middle": 0.2, "duration_s": 0.2, "onset_s": 0.3}
@@ -578,3 +580,51 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     assert [
         text for text in ("Pearson r", "0.9775", "-56.2 to +41.7", *baselines.policy_names()[1:]) if text not in printed
     ] == []
+
+
+def test_work_that_fails_without_a_result_leaves_no_folder(tmp_path: Path) -> None:
+    """Catches empty runs that look like results; what has been written before a failure stays."""
+    with pytest.raises(RuntimeError), run_folder("x", {}, 0, tmp_path / "failed"):
+        raise RuntimeError
+    assert not (tmp_path / "failed").exists()
+    with pytest.raises(ZeroDivisionError), run_folder("x", {}, 0, tmp_path / "partial") as folder:
+        _write_and_fail(folder / "episodes.csv")
+    assert (tmp_path / "partial" / "episodes.csv").exists()
+
+
+def _write_and_fail(path: Path) -> None:
+    path.write_text("seed")
+    raise ZeroDivisionError
+
+
+def test_interrupting_a_comparison_ends_its_workers_at_once(tmp_path: Path) -> None:
+    """Catches Ctrl-C that is ignored until all is done, and workers that go on without their parent."""
+    (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": ["zero", "input"] * 3}))
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from train.cli import main; main()", "compare", "long.yaml"],
+        cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60.0
+    while len(_members(process.pid)) < 4 and time.monotonic() < deadline:  # parent, manager, two workers
+        time.sleep(0.2)
+    time.sleep(2.0)
+    os.killpg(process.pid, signal.SIGINT)
+    output, _ = process.communicate(timeout=20)
+    assert process.returncode == 130, output
+    assert "Traceback" not in output
+    assert _members(process.pid) == []
+    assert not (tmp_path / "runs" / "long").exists()
+
+
+def _members(group: int) -> list[int]:
+    """Living processes of a process group."""
+    listing = subprocess.run(["ps", "-eo", "pid,pgid,stat"], capture_output=True, text=True, check=True).stdout
+    rows = [line.split() for line in listing.splitlines()[1:]]
+    return [int(pid) for pid, pgid, state in rows if int(pgid) == group and not state.startswith("Z")]
+
+
+def test_name_of_a_run_cannot_leave_its_folder(tmp_path: Path) -> None:
+    """Catches results written beside runs/, or anywhere."""
+    for name in ("../escape", "/tmp/escape", ""):
+        with pytest.raises(ConfigurationError, match="name"):
+            CompareConfig(name=name)

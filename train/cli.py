@@ -13,7 +13,6 @@ from rich.markup import escape
 
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError, ElasticError
-from elastic_env.headless import prefer_egl
 
 _CONSOLE = Console()
 
@@ -195,7 +194,6 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
-    prefer_egl()
     if "" not in sys.path and str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
     command: Any = tyro.cli(

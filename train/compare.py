@@ -5,9 +5,11 @@ import multiprocessing
 import os
 import queue
 import re
+import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,7 @@ from train.evaluate import (
     make_vector_env,
     num_steps,
 )
-from train.runs import new_run
+from train.runs import run_folder
 
 _SUMMARY = (
     ("rms", "link_error_rms_rad"),
@@ -46,8 +48,8 @@ _SUMMARY = (
 class CompareConfig(Model):
     """A comparison, as read from `configs/*.yaml`."""
 
-    name: str
-    """Name of the result folder under runs/."""
+    name: str = Field(pattern=r"^[\w.-]*\w$")
+    """Name of the result folder under runs/: letters, digits, dots, dashes."""
     env: str = "testbed"
     references: list[str | dict[str, Any]] = Field(default=["hold"], min_length=1)
     """References by name, or mappings with `kind` and parameters."""
@@ -110,10 +112,10 @@ def compare(config: CompareConfig, console: Console, output: Path | None = None,
     conditions = config.conditions()
     for condition in conditions:
         _try_out(condition)
-    folder = new_run(config.name, config.model_dump(mode="json"), config.seed, output)
-    evaluations = run_conditions(conditions, console, jobs)
-    files = [_write_csv(evaluations, folder / "episodes.csv"), _write_summary(evaluations, folder / "summary.md")]
-    files += _draw(evaluations, folder)
+    with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:
+        evaluations = run_conditions(conditions, console, jobs)
+        files = [_write_csv(evaluations, folder / "episodes.csv"), _write_summary(evaluations, folder / "summary.md")]
+        files += _draw(evaluations, folder)
     console.print(summary_table(evaluations))
     return Comparison(folder, evaluations, files)
 
@@ -126,15 +128,23 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
     jobs = min(jobs or os.cpu_count() or 1, len(conditions))
     total = sum(num_steps(condition) for condition in conditions)
     context = multiprocessing.get_context("spawn")
-    with _progress(console) as bar, context.Manager() as manager:
+    manager = SyncManager(ctx=context)
+    manager.start(_ignore_interrupts)
+    with _progress(console) as bar, manager:
         task = bar.add_task("control steps", total=total)
         steps = manager.Queue()
-        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
+        try:
             futures = [pool.submit(_evaluate_in_process, condition, steps) for condition in conditions]
             while not all(future.done() for future in futures):
                 for advance in _drain(steps):
                     bar.advance(task, advance)
+                _raise_first(futures)
             results = [future.result() for future in futures]
+        except BaseException:
+            _end(pool)
+            raise
+        pool.shutdown()
         bar.update(task, completed=total)
     return results
 
@@ -199,6 +209,28 @@ def _try_out(condition: Condition) -> None:
         raise ConfigurationError(
             f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
         )
+
+
+def _ignore_interrupts() -> None:
+    """In a worker: Ctrl-C reaches the whole process group, but the parent decides what happens."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _raise_first(futures: Sequence[Future[Evaluation]]) -> None:
+    """The error of a condition that failed, as soon as it has."""
+    for future in futures:
+        if future.done():
+            future.result()
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Stop at once: what is queued is dropped, what runs is ended."""
+    workers = list(getattr(pool, "_processes", {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for worker in workers:
+        worker.terminate()
+    for worker in workers:
+        worker.join()
 
 
 def _evaluate_in_process(condition: Condition, steps: "queue.Queue[int]") -> Evaluation:

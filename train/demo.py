@@ -11,7 +11,7 @@ from baselines.gravity_torque import make_gravity
 from train import plots
 from train.compare import CompareConfig, run_conditions, summary_table
 from train.evaluate import Evaluation, PolicySpec, make_vector_env
-from train.runs import new_run
+from train.runs import run_folder
 
 _STATIC = CompareConfig(
     name="demo",
@@ -28,20 +28,20 @@ def demo(console: Console, output: Path | None = None) -> None:
     """Run, print the table beside the paper's figures, and say where the pictures are."""
     plots.require_matplotlib()
     conditions = [*_STATIC.conditions(), *_MOTION.conditions()]
-    folder = new_run("demo", {"conditions": [c.model_dump(mode="json") for c in conditions]}, 0, output)
-    console.print("Testbed of the paper, simulated: servo, elastic gear, pendulum of 60 N·m (scenario nominal)")
-    evaluations = run_conditions(conditions, console)
-    static, motion = evaluations[:2], evaluations[2:]
-    model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
-    points = static[0].points
-    assert points is not None
-    result = identification.identify_points(points, [make_gravity(model)])
-    result.save(folder / "identification.json")
-    figures = [
-        plots.draw_identification(result, points, [model], folder / "fig5_identification.png"),
-        plots.draw_static_errors(static, model, folder / "fig6_static_errors.png"),
-        plots.draw_time_series(motion, folder / "sine.png"),
-    ]
+    with run_folder("demo", {"conditions": [c.model_dump(mode="json") for c in conditions]}, 0, output) as folder:
+        console.print("Testbed of the paper, simulated: servo, elastic gear, pendulum of 60 N·m (scenario nominal)")
+        evaluations = run_conditions(conditions, console)
+        static, motion = evaluations[:2], evaluations[2:]
+        model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
+        points = static[0].points
+        assert points is not None
+        result = identification.identify_points(points, [make_gravity(model)])
+        result.save(folder / "identification.json")
+        figures = [
+            plots.draw_identification(result, points, [model], folder / "fig5_identification.png"),
+            plots.draw_static_errors(static, model, folder / "fig6_static_errors.png"),
+            plots.draw_time_series(motion, folder / "sine.png"),
+        ]
     console.print(_paper_table(result, static))
     console.print(summary_table(motion))
     console.print("Figures and data:")

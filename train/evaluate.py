@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from pydantic import field_validator
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
@@ -64,6 +65,14 @@ class Condition(Model):
     """Further arguments of the environment, such as stiffness."""
     episodes: int = quantity("1", 1, ge=1, description="number of episodes")
     seed: int = quantity("1", 0, ge=0, description="seed of the first episode; the next ones follow")
+
+    @field_validator("env_options")
+    @classmethod
+    def _options_are_not_taken(cls, value: dict[str, Any]) -> dict[str, Any]:
+        taken = sorted(value.keys() & {"reference", "scenario", "num_envs", "num_threads", "autoreset_mode"})
+        if taken:
+            raise ValueError(f"{', '.join(taken)} cannot be given here but have keys of their own, or no place")
+        return value
 
     @property
     def reference_name(self) -> str:

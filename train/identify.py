@@ -17,7 +17,7 @@ from baselines.identification import Identification, identify
 from elastic_env.config import Model, quantity
 from elastic_env.robots.testbed import Pendulum
 from train import plots
-from train.runs import new_run
+from train.runs import run_folder
 
 
 class IdentifyConfig(Model):
@@ -55,21 +55,21 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
     """
     plots.require_matplotlib()
     envs = _environments(config)
-    folder = new_run("identify", config.model_dump(mode="json"), config.seed, output)
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("visiting static positions", total=1.0)
-        results, points = identify(envs, config.seed, lambda share: bar.update(task, completed=share))
-    results[0].save(folder / "identification.json")
-    models = [env.unwrapped.assumed_model for env in envs]
-    files = [
-        folder / "identification.json",
-        plots.draw_identification(results[0], points[0], models, folder / "identification.png"),
-    ]
-    console.print(result_table(results[0]))
-    if config.repeats > 1:
-        files.append(_write_repeats(results, config.seed, folder / "repeats.csv"))
-        console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
+    with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
+        columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task("visiting static positions", total=1.0)
+            results, points = identify(envs, config.seed, lambda share: bar.update(task, completed=share))
+        results[0].save(folder / "identification.json")
+        models = [env.unwrapped.assumed_model for env in envs]
+        files = [
+            folder / "identification.json",
+            plots.draw_identification(results[0], points[0], models, folder / "identification.png"),
+        ]
+        console.print(result_table(results[0]))
+        if config.repeats > 1:
+            files.append(_write_repeats(results, config.seed, folder / "repeats.csv"))
+            console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)
     return results

@@ -80,7 +80,9 @@ def _film(env: Any, policy: Any, seed: int, steps: int, period: float, video: Pa
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     video.parent.mkdir(parents=True, exist_ok=True)
     writer: Any
-    with imageio.get_writer(video, fps=1.0 / (every * period)) as writer:
+    frame_s = every * period
+    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if video.suffix == ".gif" else {"fps": 1.0 / frame_s}
+    with imageio.get_writer(video, **timing) as writer:
         for step in track(_episode(env, policy, seed, steps), "filming", total=steps, console=console, transient=True):
             if step % every == 0:
                 writer.append_data(env.render())

@@ -3,6 +3,8 @@
 import json
 import platform
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
@@ -38,6 +40,26 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
     (folder / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True))
     (folder / "metadata.json").write_text(json.dumps(_metadata(seed), indent=2) + "\n")
     return folder
+
+
+@contextmanager
+def run_folder(
+    name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
+) -> Iterator[Path]:
+    """A new run for the work within; it goes again if the work is interrupted or fails without a result.
+
+    Arguments and errors as `new_run`.
+    """
+    folder = new_run(name, configuration, seed, output)
+    described = set(folder.iterdir())
+    try:
+        yield folder
+    except BaseException:
+        if set(folder.iterdir()) == described:
+            for file in described:
+                file.unlink()
+            folder.rmdir()
+        raise
 
 
 def _next_free(folder: Path) -> Path:

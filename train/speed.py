@@ -21,7 +21,7 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.config import Model, quantity
 from elastic_env.signals import Array
 from train.evaluate import ENVIRONMENTS
-from train.runs import new_run
+from train.runs import run_folder
 
 
 class SpeedConfig(Model):
@@ -141,11 +141,13 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
     Raises:
         ResultsExistError: The output folder holds results.
     """
-    path = new_run("speed", config.model_dump(mode="json"), None, output) / "speed.json"
-    results = [
-        measure(n, config.steps, config.rounds, config.threads)
-        for n in track(config.num_envs, "measuring", console=console, transient=True)
-    ]
+    with run_folder("speed", config.model_dump(mode="json"), None, output) as folder:
+        results = [
+            measure(n, config.steps, config.rounds, config.threads)
+            for n in track(config.num_envs, "measuring", console=console, transient=True)
+        ]
+        path = folder / "speed.json"
+        path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
     table = Table(title="vector environment against raw mj_step, medians of one interleaved run")
     for name in ("worlds", "threads", "env steps/s", "raw steps/s", "ratio"):
         table.add_column(name, justify="right")
@@ -153,5 +155,4 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
         rates = f"{r.env_steps_per_s:,.0f}", f"{r.raw_steps_per_s:,.0f}"
         table.add_row(str(r.num_envs), str(r.threads), *rates, f"{r.ratio:.3f}")
     console.print(table)
-    path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
     return path

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from elastic_env.elasticity import ElasticJoint, Servo
 from elastic_env.errors import ConfigurationError
-from elastic_env.signals import Array
+from elastic_env.signals import NO_SIGNALS, Array, SignalTable
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Where an identification file holds K."""
@@ -27,6 +27,8 @@ class RobotModel:
     joints: Mapping[str, ElasticJoint]
     rigid: mujoco.MjModel
     control_period_s: float
+    observation_table: SignalTable = NO_SIGNALS
+    """What its observation holds, in order."""
 
     @property
     def joint_names(self) -> list[str]:
@@ -101,9 +103,12 @@ def read_stiffness(value: float | str | Path) -> float:
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
-    if isinstance(value, int | float):
-        return float(value)
-    path = Path(value)
+    if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
+        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {value!r}")
+    try:
+        return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
+    except (TypeError, ValueError):
+        path = Path(value)  # pyright: ignore[reportArgumentType]
     if not path.is_file():
         raise ConfigurationError(
             f"stiffness must be a number [N·m/rad] or an identification file, found no file {path}"

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastic_env.elasticity import ElasticJoint, joint_torque, static_deflection, static_link_angle
+from elastic_env.elasticity import ElasticJoint, joint_torque, static_link_angle
 from elastic_env.metrics import Metric
 from elastic_env.plan import PlanTable
 from elastic_env.robots.joint_names import JointAddresses
@@ -104,9 +104,9 @@ class TestbedTask:
         self.num_worlds = num_worlds
         self.num_substeps = num_substeps(config)
         self.observation_table = SignalTable((*OBSERVATION, LINK_IMU)) if config.observe_link else OBSERVATION
-        self.assumed_model = config.robot_model(config.joint, config.pendulum)
+        self.assumed_model = config.robot_model(config.joint, config.pendulum, self.observation_table)
         self._joint, self._pendulum = config.true_joint, config.true_pendulum
-        self._true_model = config.robot_model(self._joint, self._pendulum)
+        self._true_model = config.robot_model(self._joint, self._pendulum, self.observation_table)
         self.model = elastic_spec(self._pendulum, self._joint, config.form, config.timestep_s).compile()
         self._at = JointAddresses.of(self.model, [JOINT])
         self._noise = NoiseStream(num_worlds, width=1)
@@ -261,6 +261,6 @@ class _Measurement:
 
 def _rest_angle(theta: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
     """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
-    half = static_deflection(np.sign(theta), np.inf, joint.backlash)
+    half = np.sign(theta) * joint.backlash / 2.0
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
     return static_link_angle(engaged, joint.stiffness, pendulum.torque, pendulum.torque_gradient)

@@ -12,6 +12,7 @@ from elastic_env.robots.dynamixel import H54_200_S500_R
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.robots.testbed import JOINT, Pendulum, rigid_spec
 from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.signals import SignalTable
 
 
 class RewardWeights(Model):
@@ -55,9 +56,9 @@ class TestbedConfig(Model):
         """The pendulum as the plant has it."""
         return self.pendulum.with_mass_scaled(self.scenario.pendulum_mass_scale)
 
-    def robot_model(self, joint: ElasticJoint, pendulum: Pendulum) -> RobotModel:
+    def robot_model(self, joint: ElasticJoint, pendulum: Pendulum, table: SignalTable) -> RobotModel:
         """Rigid model and joint of this testbed with the given parameters."""
-        return RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), self.control_period_s)
+        return RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), self.control_period_s, table)
 
 
 def num_substeps(config: TestbedConfig) -> int:
