@@ -206,7 +206,7 @@ def test_coupled_rest_angles_of_a_batch_are_those_of_its_rows() -> None:
         ("coulomb_friction", -0.1, r"a finite number >= 0 \[N·m\], got -0\.1"),
         ("viscous_friction", -0.1, r"a finite number >= 0 \[N·m·s/rad\], got -0\.1"),
         ("backlash", -1e-3, r"a finite number >= 0 \[rad\], got -0\.001"),
-        ("encoder_counts_per_turn", 0, r"a finite number > 0 \[1\], got 0"),
+        ("encoder_counts_per_turn", 0, r"a whole number > 0, got 0"),
     ],
 )
 def test_a_parameter_out_of_bounds_names_itself_its_unit_and_bound(
