@@ -13,6 +13,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -542,8 +543,11 @@ def test_raw_stepping_does_the_work_of_the_environment() -> None:
         env.step(np.full((3, 1), 0.01, dtype=np.float32))
         controls[step] = inside.simulation.ctrl
     raw.run(controls)
-    worlds = sorted((world for share in raw._shares for world in share), key=lambda pair: pair[0])
-    np.testing.assert_array_equal([data.qpos for _, data in worlds], inside.simulation.qpos)
+    data, kind = mujoco.MjData(inside.task.model), int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    for state, qpos, qvel in zip(raw._states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
+        mujoco.mj_setState(inside.task.model, data, state, kind)
+        np.testing.assert_array_equal(data.qpos, qpos)
+        np.testing.assert_array_equal(data.qvel, qvel)
 
 
 def test_play_films_the_episode_and_keeps_an_existing_film(capsys: pytest.CaptureFixture[str]) -> None:
