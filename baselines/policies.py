@@ -39,10 +39,7 @@ def _zero(env: Any, options: PolicyOptions) -> Policy:  # noqa: ARG001  one sign
 def _compensated(compensator: type[GravityCompensator] | type[DynamicCompensator]) -> Callable[..., Policy]:
     def build(env: Any, options: PolicyOptions) -> Policy:
         model, table = _assumed(env, options), env.unwrapped.task.observation_table
-        return Compensated(
-            Zero(table), compensator(model, options.output, options.gravity), table, model.control_period_s,
-            options.ramp_s,
-        )  # fmt: skip
+        return Compensated(Zero(table), compensator(model, options.output, options.gravity), ramp_s=options.ramp_s)
 
     return build
 

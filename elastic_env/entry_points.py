@@ -42,9 +42,9 @@ def configure_testbed(
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    for name, given in (("joint", joint), ("pendulum", pendulum)):
-        if not isinstance(given, dict | ElasticJoint | Pendulum | None):
-            raise ConfigurationError(f"{name} must be a model or a mapping of parameters, got {given!r}")
+    for name, given, model in (("joint", joint, ElasticJoint), ("pendulum", pendulum, Pendulum)):
+        if not isinstance(given, dict | model | None):
+            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
     chosen = joint if isinstance(joint, ElasticJoint) else H54_200_S500_R.replace(**(joint or {}))
     if stiffness is not None:
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))

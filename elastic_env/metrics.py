@@ -9,11 +9,6 @@ import numpy as np
 from elastic_env.signals import Array, BoolArray, Signals
 
 
-def rms(values: Array, axis: int = 0) -> Array:
-    """Root mean square along an axis."""
-    return np.sqrt(np.mean(np.square(values), axis=axis))
-
-
 @dataclass(frozen=True)
 class Metric:
     """One figure of an episode: a statistic of a signal, over its scored steps or over all.

@@ -59,11 +59,6 @@ class SignalTable:
         high = np.array([signal.high for signal in self.signals])
         return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
 
-    def markdown(self) -> str:
-        """The table as a reader wants it: column, name, unit, meaning."""
-        rows = [f"| {i} | `{s.name}` | {s.unit} | {s.meaning} |" for i, s in enumerate(self.signals)]
-        return "\n".join(["| column | name | unit | meaning |", "|---|---|---|---|", *rows])
-
 
 NO_SIGNALS = SignalTable(())
 """The table of an observation that holds nothing."""

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from elastic_env.metrics import EpisodeMetrics, Metric, RunningStatistics, rms
+from elastic_env.metrics import EpisodeMetrics, Metric, RunningStatistics
 from elastic_env.signals import Array, BoolArray
 
 STATISTICS = {
@@ -78,10 +78,3 @@ def test_values_do_not_share_memory_with_what_comes_later() -> None:
     values = metrics.values()
     metrics.update({"x": np.full(1, 9.0), "y": np.ones(1)}, np.ones(1, dtype=bool))
     assert all(value[0] == 1.0 for value in values.values())
-
-
-def test_rms_along_an_axis() -> None:
-    """Catches a standard deviation in place of the root mean square."""
-    x = np.array([[3.0, 1.0], [4.0, 1.0]])
-    np.testing.assert_allclose(rms(x), [np.sqrt(12.5), 1.0], rtol=1e-15)
-    np.testing.assert_allclose(rms(x, axis=1), [np.sqrt(5.0), np.sqrt(8.5)], rtol=1e-15)

@@ -88,7 +88,7 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
         color="#888888",
         lw=1.0,
         ls=":",
-        label=f"plain line, {_k(result.line_stiffness_nm_per_rad)}",
+        label=f"plain line, K = {result.line_stiffness_nm_per_rad:.1f}",
     )
     top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}")
     top.text(
@@ -201,10 +201,6 @@ def _fitted(result: Identification, torque: np.ndarray, direction: int) -> np.nd
 
 def _interval(result: Identification) -> str:
     return f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
-
-
-def _k(stiffness: float) -> str:
-    return f"K = {stiffness:.1f}"
 
 
 def _paper(policy: str) -> str:
