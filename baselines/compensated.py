@@ -48,13 +48,13 @@ class Compensated:
             ElasticError: Called in the middle of an episode without the state of the last call.
         """
         rows = self._view.rows(observation)
-        desired = self._view.motion(rows)
+        desired, compensator = self._view.motion(rows), self.compensator.at(rows)
         memory, inner_state = resume(
-            state, episode_start, rows, self._view, lambda: np.pad(self.compensator.begin(desired), ((0, 0), (1, 0)))
+            state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1, 0)))
         )
-        action, inner_state = self._inner(rows, inner_state, episode_start, deterministic, observation.ndim, memory)
+        action, inner_state = self._inner(compensator, rows, inner_state, episode_start, deterministic, observation.ndim, memory)
         wanted = Motion(desired.q + action, desired.q_dot, desired.q_ddot)
-        offset, kept = self.compensator.offset(wanted, memory[:, 1:])
+        offset, kept = compensator.offset(wanted, memory[:, 1:])
         steps = memory[:, :1] + 1.0
         share, _, _ = quintic(steps / self._ramp_steps)
         total = (action + share * offset).astype(np.float32)
@@ -63,17 +63,24 @@ class Compensated:
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Estimated link angle for an observation and the state that `predict` returned for it, (..., n) [rad]."""
         memory, _ = state
-        theta = self._view.theta(self._view.rows(observation))
-        estimate = self.compensator.link_angle(theta, memory[:, 1:])
+        rows = self._view.rows(observation)
+        estimate = self.compensator.at(rows).link_angle(self._view.theta(rows), memory[:, 1:])
         return estimate.reshape((*observation.shape[:-1], estimate.shape[-1]))
 
     def _inner(
-        self, rows: Array, state: Any, episode_start: Any, deterministic: bool, ndim: int, memory: Array
+        self,
+        compensator: Compensator,
+        rows: Array,
+        state: Any,
+        episode_start: Any,
+        deterministic: bool,
+        ndim: int,
+        memory: Array,
     ) -> tuple[Array, Any]:
         """The wrapped policy's action on an observation whose encoder columns are those of the links."""
         theta, theta_dot = self._view.theta(rows), self._view.theta_dot(rows)
         seen = self._view.with_links(
-            rows, self.compensator.link_angle(theta, memory[:, 1:]), self.compensator.link_rate(theta, theta_dot)
+            rows, compensator.link_angle(theta, memory[:, 1:]), compensator.link_rate(theta, theta_dot)
         )
         action, state = self.policy.predict(seen if ndim > 1 else seen[0], state, episode_start, deterministic)
         return np.atleast_2d(np.asarray(action, dtype=np.float64)), state

@@ -4,19 +4,19 @@ An input compensator says by how much the motor side has to lead so that the lin
 compensator says where the link is when the motor encoder shows θ. All work on (..., n) arrays.
 """
 
+import copy
 from dataclasses import dataclass
 from typing import Literal, Protocol, get_args
 
 import numpy as np
 
-from baselines.gravity_torque import GravityMethod, GravityModel, make_gravity
+from baselines.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
 from elastic_env.elasticity import solve_stiffness, static_deflection, static_link_angle
 from elastic_env.errors import unknown_name
-from elastic_env.rigid_body import RigidBody
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array
 
-OutputMethod = Literal["taylor", "newton"]
+OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,10 @@ class Compensator(Protocol):
     model: RobotModel
     memory_width: int
 
+    def at(self, rows: Array) -> "Compensator":
+        """The compensator for the loads at the control steps of observations, (num_worlds, m)."""
+        ...
+
     def begin(self, motion: Motion) -> Array:
         """Memory at rest at the start of an episode, (num_worlds, memory_width)."""
         ...
@@ -98,22 +102,32 @@ class GravityCompensator:
 
     Args:
         model: Assumed robot.
-        output: "taylor" for Eq. 12, "newton" for Eq. 10.
-        method: How the gravity torque is computed.
+        output: "taylor" for Eq. 12, "newton" for Eq. 10, "wrench" for Eq. 12 with the torque of the measured foot
+            wrenches (walker), "none" to leave the encoder as it is.
+        method: How the gravity torque is computed; None for the robot's default.
 
     Raises:
-        ConfigurationError: Unknown output method or gravity method.
+        ConfigurationError: Unknown output method or gravity method, or one that the robot does not have.
     """
 
     memory_width = 0
 
-    def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod = "pinocchio") -> None:
+    def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
         if output not in get_args(OutputMethod):
             raise unknown_name("output compensator", output, get_args(OutputMethod))
         self.model = model
         self.stiffness = model.stiffness
-        self.gravity = make_gravity(model, method)
-        self._solve = taylor_link_angle if output == "taylor" else newton_link_angle
+        self.gravity = self._load = make_gravity(model, method)
+        """τ_g of the desired posture and of the measured one."""
+        self._source, self._load_source = self.gravity, make_load(model, output, self.gravity)
+        self._output = output
+
+    def at(self, rows: Array) -> "GravityCompensator":
+        """See `Compensator`."""
+        bound = copy.copy(self)
+        bound.gravity = self._source.at(rows)
+        bound._load = self._load_source.at(rows, level=False)
+        return bound
 
     def begin(self, motion: Motion) -> Array:
         """See `Compensator`."""
@@ -125,13 +139,18 @@ class GravityCompensator:
 
     def link_angle(self, theta: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
         """See `Compensator`."""
-        return self._solve(theta, self.stiffness, self.gravity)
+        if self._output == "none":
+            return theta
+        solve = newton_link_angle if self._output == "newton" else taylor_link_angle
+        return solve(theta, self.stiffness, self._load)
 
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
         """See `Compensator`: the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇ at the estimated link angle."""
+        if self._output == "none":
+            return theta_dot
         K = np.broadcast_to(self.stiffness, theta.shape)
-        q = self._solve(theta, self.stiffness, self.gravity)
-        return solve_stiffness(K, self.gravity.gravity_gradient(q), K * theta_dot)
+        q = self.link_angle(theta, theta)
+        return solve_stiffness(K, self._load.gravity_gradient(q), K * theta_dot)
 
 
 class DynamicCompensator:
@@ -146,7 +165,7 @@ class DynamicCompensator:
     Args:
         model: Assumed robot, with a servo on every joint.
         output: Method for the rate estimate and for the start, as in `GravityCompensator`.
-        method: How the gravity torque of the output side is computed.
+        method: How the static torque is computed; None for the robot's default.
         friction: Whether the model's Coulomb friction is part of the joint torque.
     """
 
@@ -157,12 +176,13 @@ class DynamicCompensator:
         self,
         model: RobotModel,
         output: OutputMethod = "taylor",
-        method: GravityMethod = "pinocchio",
+        method: GravityMethod | None = None,
         friction: bool = False,
     ) -> None:
         self.model = model
         self._static = GravityCompensator(model, output, method)
-        self._body = RigidBody(model.rigid, model.joint_names)
+        self._body = self._source = make_dynamics(model, self._static.gravity)
+        self._measures = output == "wrench"
         self._n, self._dt = len(model.joint_names), model.control_period_s
         self._K, self._D, self._B = model.stiffness, model.damping, model.rotor_inertia
         self._backlash, self._viscous = model.backlash, model.viscous_friction
@@ -172,6 +192,12 @@ class DynamicCompensator:
         self._kv = np.array([servo.velocity_gain for servo in servos])
         self._ki = np.array([servo.integral_gain for servo in servos])
         self.memory_width = 4 * self._n
+
+    def at(self, rows: Array) -> "DynamicCompensator":
+        """See `Compensator`."""
+        bound = copy.copy(self)
+        bound._static, bound._body = self._static.at(rows), self._source.at(rows)
+        return bound
 
     def begin(self, motion: Motion) -> Array:
         """See `Compensator`."""
@@ -199,7 +225,9 @@ class DynamicCompensator:
         return offset, np.concatenate([deflection, rate, windup, friction], axis=-1)
 
     def link_angle(self, theta: Array, memory: Array) -> Array:
-        """See `Compensator`: the deflection of the desired motion, subtracted from the encoder."""
+        """See `Compensator`: the deflection of the desired motion, or of the measured wrenches, off the encoder."""
+        if self._measures:
+            return self._static.link_angle(theta, memory)
         return theta - memory[..., : self._n]
 
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:

@@ -4,17 +4,20 @@
 NumPy for a whole batch at once. Both agree to rounding.
 """
 
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import mujoco
 import numpy as np
 
-from elastic_env.errors import unknown_name
+from baselines.contact_torque import ContactGravity, ContactMethod, PlannedTorque, WrenchTorque
+from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.rigid_body import RigidBody, require_hinge_tree
-from elastic_env.robots.robot_model import RobotModel
+from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.signals import Array
 
-GravityMethod = Literal["pinocchio", "batched"]
+GravityMethod = Literal["pinocchio", "batched", "com", "ankle", "lumped"]
+
+_FIXED_METHODS = ("pinocchio", "batched")
 
 
 class GravityModel(Protocol):
@@ -29,17 +32,64 @@ class GravityModel(Protocol):
         ...
 
 
-def make_gravity(model: RobotModel, method: GravityMethod = "pinocchio") -> GravityModel:
-    """The gravity torque of a robot model by a chosen method.
+class FixedGravity:
+    """Gravity torque of a robot that stands on nothing but its base: the same at every control step."""
+
+    def __init__(self, gravity: GravityModel) -> None:
+        self.gravity_torque, self.gravity_gradient = gravity.gravity_torque, gravity.gravity_gradient
+
+    def at(self, rows: Array, level: bool = True) -> "FixedGravity":  # noqa: ARG002  a walker's
+        """Itself."""
+        return self
+
+
+class FixedDynamics:
+    """Inverse dynamics of a robot on a fixed base."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self.inverse_dynamics = RigidBody(model.rigid, model.joint_names).inverse_dynamics
+
+    def at(self, rows: Array) -> "FixedDynamics":  # noqa: ARG002  a walker's
+        """Itself."""
+        return self
+
+
+def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
+    """The gravity torque of a robot model by a chosen method; a `GravityModel` after `at(observations)`.
+
+    A robot on a fixed base has "pinocchio" (default) and "batched", and is a `GravityModel` at once; a walker has the
+    methods of `baselines.contact_torque`: "com" (default), "ankle" and "lumped".
 
     Raises:
-        ConfigurationError: The method does not exist.
+        ConfigurationError: The method does not exist, or not for this robot.
     """
-    if method == "pinocchio":
-        return RigidBody(model.rigid, model.joint_names)
+    if isinstance(model, WalkerModel):
+        if method is not None and method not in get_args(ContactMethod):
+            raise unknown_name("gravity method of a walker", method, get_args(ContactMethod))
+        return ContactGravity(model, method or "com")
+    if method in (None, "pinocchio"):
+        return FixedGravity(RigidBody(model.rigid, model.joint_names))
     if method == "batched":
-        return BatchedGravity(model)
-    raise unknown_name("gravity method", method, get_args(GravityMethod))
+        return FixedGravity(BatchedGravity(model))
+    raise unknown_name("gravity method", method, _FIXED_METHODS)
+
+
+def make_load(model: RobotModel, output: str, gravity: Any) -> Any:
+    """The torque that an output compensator takes: of gravity, or of the measured foot wrenches.
+
+    Raises:
+        ConfigurationError: The robot has no feet.
+    """
+    if output != "wrench":
+        return gravity
+    if not isinstance(model, WalkerModel):
+        raise ConfigurationError("the output compensator 'wrench' needs a walker with force-torque sensors at its feet")
+    return WrenchTorque(model)
+
+
+def make_dynamics(model: RobotModel, gravity: Any) -> Any:
+    """Inverse dynamics of a robot model: of any motion on a fixed base, of the planned one for a walker."""
+    return PlannedTorque(model, gravity) if isinstance(model, WalkerModel) else FixedDynamics(model)
 
 
 class BatchedGravity:

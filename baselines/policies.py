@@ -5,7 +5,6 @@ and shows it compensated encoder readings. The named policies are such compositi
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from baselines.compensated import Compensated
@@ -13,10 +12,11 @@ from baselines.compensators import DynamicCompensator, GravityCompensator, Outpu
 from baselines.gravity_torque import GravityMethod
 from baselines.oracle import Oracle
 from baselines.policy import Policy, Zero
+from baselines.walking_controller import WalkingController, WalkingGains
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.plan import STAND_S
-from elastic_env.robots.robot_model import RobotModel, read_stiffness
+from elastic_env.robots.robot_model import RobotModel, WalkerModel, read_stiffness
 
 
 class PolicyOptions(Model):
@@ -25,26 +25,28 @@ class PolicyOptions(Model):
     stiffness: Any = None
     """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of an identification;
     None for the environment's assumed model."""
-    output: OutputMethod = "taylor"
-    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10."""
-    gravity: GravityMethod = "pinocchio"
-    """How τ_g is computed: "pinocchio" row by row, or "batched" in NumPy."""
+    output: OutputMethod | None = None
+    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and "none"; None for
+    what the policy's name says."""
+    gravity: GravityMethod | None = None
+    """How τ_g is computed: on the testbed "pinocchio" or "batched", on the walker "com", "ankle" or "lumped"; None for
+    the first of them."""
+    com_feedback: bool = True
+    """Walker: whether the controller feeds the center of mass back."""
+    gains: WalkingGains = WalkingGains()
+    """Walker: gains of the controller."""
     ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")
 
 
-def _zero(env: Any, options: PolicyOptions) -> Policy:  # noqa: ARG001  one signature for all
-    return Zero(env.unwrapped.task.observation_table)
+Builder = Callable[[Any, RobotModel, PolicyOptions], Policy]
+Compensating = type[GravityCompensator] | type[DynamicCompensator]
 
 
-def _compensated(compensator: type[GravityCompensator] | type[DynamicCompensator]) -> Callable[..., Policy]:
-    def build(env: Any, options: PolicyOptions) -> Policy:
-        model, table = _assumed(env, options), env.unwrapped.task.observation_table
-        return Compensated(Zero(table), compensator(model, options.output, options.gravity), ramp_s=options.ramp_s)
-
-    return build
+def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001  one signature for all
+    return Zero(model.observation_table)
 
 
-def _oracle(env: Any, options: PolicyOptions) -> Policy:
+def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
     if options.stiffness is not None:
         raise ConfigurationError(
             f"the oracle knows the true stiffness, got stiffness={options.stiffness!r}; leave it out"
@@ -52,19 +54,54 @@ def _oracle(env: Any, options: PolicyOptions) -> Policy:
     return Oracle(env, options.ramp_s)
 
 
-POLICIES: dict[str, Callable[[Any, PolicyOptions], Policy]] = {
+def _around_zero(compensator: Compensating) -> Builder:
+    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+        made = compensator(model, options.output or "taylor", options.gravity)
+        return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
+
+    return build
+
+
+def _controller(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
+    return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)  # type: ignore[arg-type]
+
+
+def _around_controller(compensator: Compensating, output: OutputMethod) -> Builder:
+    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+        made = compensator(model, options.output or output, options.gravity)
+        return Compensated(_controller(env, model, options), made, ramp_s=options.ramp_s)
+
+    return build
+
+
+def _open(build: Builder) -> Builder:
+    return lambda env, model, options: build(env, model, options.replace(com_feedback=False))
+
+
+_ON_THE_TESTBED: dict[str, Builder] = {
     "zero": _zero,
     "uncompensated": _zero,
-    "input": _compensated(GravityCompensator),
-    "dynamic": _compensated(DynamicCompensator),
+    "input": _around_zero(GravityCompensator),
+    "dynamic": _around_zero(DynamicCompensator),
     "oracle": _oracle,
 }
-"""Named policies of the testbed; there `uncompensated` has no controller to add and equals `zero`."""
+"""On the testbed `uncompensated` has no controller to add and equals `zero`."""
+
+_ON_THE_WALKER: dict[str, Builder] = {
+    "zero": _zero,
+    "uncompensated_open": _open(_controller),
+    "uncompensated": _controller,
+    "input_open": _open(_around_controller(GravityCompensator, "none")),
+    "input": _around_controller(GravityCompensator, "none"),
+    "input_output": _around_controller(GravityCompensator, "taylor"),
+    "input_wrench": _around_controller(GravityCompensator, "wrench"),
+    "dynamic": _around_controller(DynamicCompensator, "wrench"),
+}
 
 
 def policy_names() -> list[str]:
     """Names that `make` accepts."""
-    return list(POLICIES)
+    return list(_ON_THE_WALKER | _ON_THE_TESTBED)
 
 
 def make(name: str, env: Any, **options: Any) -> Policy:
@@ -88,19 +125,20 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     Raises:
         ConfigurationError: Unknown name or option, or an environment that is not ours.
     """
-    if name not in POLICIES:
-        raise unknown_name("policy", name, POLICIES)
+    if name not in policy_names():
+        raise unknown_name("policy", name, policy_names())
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
             'gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to run on a wrapper of it'
         )
-    return POLICIES[name](env, PolicyOptions(**options))
+    model, chosen = _assumed(env, PolicyOptions(**options)), PolicyOptions(**options)
+    known = _ON_THE_WALKER if isinstance(model, WalkerModel) else _ON_THE_TESTBED
+    if name not in known:
+        raise unknown_name(f"policy of {type(env.unwrapped.task).__name__}", name, known)
+    return known[name](env, model, chosen)
 
 
 def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
     model: RobotModel = env.unwrapped.assumed_model
-    if options.stiffness is None:
-        return model
-    given = options.stiffness
-    return model.with_stiffness(read_stiffness(given) if isinstance(given, int | float | str | Path) else given)
+    return model if options.stiffness is None else model.with_stiffness(read_stiffness(options.stiffness))

@@ -31,7 +31,7 @@ class Zero:
     """Plays the reference back: no offset, no memory, and it takes the encoder for the link."""
 
     def __init__(self, table: SignalTable) -> None:
-        self._encoder = table.columns("encoder_angle")
+        self._encoder = table.group("encoder_angle")
 
     def predict(
         self,
@@ -53,9 +53,9 @@ class ObservationView:
 
     def __init__(self, table: SignalTable) -> None:
         self._width = len(table)
-        self._theta, self._theta_dot = table.columns("encoder_angle"), table.columns("encoder_rate")
-        self._q, self._q_dot = table.columns("reference_angle"), table.columns("reference_rate")
-        self._q_ddot, self._command = table.columns("reference_acceleration"), table.columns("last_command")
+        self._theta, self._theta_dot = table.group("encoder_angle"), table.group("encoder_rate")
+        self._q, self._q_dot = table.group("reference_angle"), table.group("reference_rate")
+        self._q_ddot, self._command = table.group("reference_acceleration"), table.group("last_command")
 
     def theta(self, rows: Array) -> Array:
         """Encoder angles, (num_worlds, n) [rad]."""

@@ -16,3 +16,8 @@ gymnasium.register(
     entry_point="elastic_env.entry_points:make_testbed",
     vector_entry_point="elastic_env.entry_points:make_testbed_vector",
 )
+gymnasium.register(
+    id="elastic_env/WalkInPlace-v0",
+    entry_point="elastic_env.entry_points:make_walk",
+    vector_entry_point="elastic_env.entry_points:make_walk_vector",
+)

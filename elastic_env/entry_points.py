@@ -1,8 +1,9 @@
 """Entry points of the registered environments: arguments of `gymnasium.make` become a task behind a face."""
 
 import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from gymnasium.vector import AutoresetMode
 
@@ -10,13 +11,19 @@ from elastic_env.elasticity import ElasticJoint
 from elastic_env.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.references import AnyReference, make_reference
-from elastic_env.rendering import TestbedPicture
+from elastic_env.rendering import TestbedPicture, WalkerPicture
 from elastic_env.robots.dynamixel import H54_200_S500_R
-from elastic_env.robots.robot_model import read_stiffness
+from elastic_env.robots.robot_model import read_stiffness, with_stiffness
 from elastic_env.robots.testbed import Pendulum
+from elastic_env.robots.thormang import Thormang
 from elastic_env.scenario import Scenario, make_scenario
 from elastic_env.tasks.testbed import TestbedTask
 from elastic_env.tasks.testbed_config import TestbedConfig
+from elastic_env.tasks.walk_config import WalkConfig
+from elastic_env.tasks.walk_in_place import WalkTask
+from elastic_env.walking.gait import Gait, make_gait
+
+ConfigT = TypeVar("ConfigT")
 
 
 def configure_testbed(
@@ -58,9 +65,57 @@ def configure_testbed(
     )
 
 
+def configure_walk(
+    step_period: float | list[float] | tuple[float, float, float] | Gait = 3.0,
+    num_steps: int | None = None,
+    scenario: str | Scenario = "nominal",
+    stiffness: float | str | Path | list[float] | None = None,
+    joint: ElasticJoint | dict[str, Any] | None = None,
+    robot: Thormang | dict[str, Any] | None = None,
+    gait: dict[str, Any] | None = None,
+    form: Literal["tendon", "rigid"] = "tendon",
+) -> WalkConfig:
+    """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
+
+    Args:
+        step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support [s], or a `Gait`.
+        num_steps: Number of steps; default 4, or that of the `Gait`.
+        scenario: Name as in `elastic_env.scenario`, or a `Scenario`.
+        stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an `identification.json`; default
+            that of the joints.
+        joint: Elastic joint for all twelve, or a mapping of what differs from the paper's H54-200-S500-R, the default.
+        robot: The robot's options, or a mapping of them: hip_half_spacing, twin_knee, friction.
+        gait: What differs from the default gait: lift_m, hip_height_m, transfer.
+        form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
+
+    Raises:
+        ConfigurationError: A name, a parameter or a combination that does not exist.
+    """
+    for name, given, model in (("joint", joint, ElasticJoint), ("robot", robot, Thormang)):
+        if not isinstance(given, dict | model | None):
+            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
+    if not isinstance(gait, dict | None):
+        raise ConfigurationError(f"gait must be a mapping of parameters of Gait, got {gait!r}; see also step_period")
+    chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
+    if isinstance(joint, ElasticJoint):
+        joints = {name: joint for name in chosen.joints}
+    else:
+        joints = {name: own.replace(**(joint or {})) for name, own in chosen.joints.items()}
+    if stiffness is not None:
+        joints = with_stiffness(joints, read_stiffness(stiffness))
+    steps = {} if num_steps is None else {"num_steps": num_steps}
+    return WalkConfig(
+        gait=make_gait(step_period, **steps, **(gait or {})),
+        scenario=make_scenario(scenario),
+        robot=chosen,
+        joints=joints,
+        form=form,
+    )
+
+
 def make_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
-    config = _configure(arguments)
+    config = _configure(configure_testbed, "elastic_env/Testbed-v0", arguments)
     return ElasticEnv(TestbedTask(config, num_worlds=1), render_mode, lambda: TestbedPicture(config.pendulum))
 
 
@@ -72,18 +127,43 @@ def make_testbed_vector(
     **arguments: Any,
 ) -> ElasticVectorEnv:
     """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
+    _require_vector_arguments(num_envs, num_threads, render_mode)
+    config = _configure(configure_testbed, "elastic_env/Testbed-v0", arguments)
+    return ElasticVectorEnv(TestbedTask(config, num_envs), num_threads, autoreset_mode)
+
+
+def make_walk(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
+    """Entry point of `elastic_env/WalkInPlace-v0`; arguments as in `configure_walk`."""
+    config = _configure(configure_walk, "elastic_env/WalkInPlace-v0", arguments)
+    task = WalkTask(config, num_worlds=1)
+    return ElasticEnv(task, render_mode, lambda: WalkerPicture(task))
+
+
+def make_walk_vector(
+    num_envs: int = 1,
+    num_threads: int = 0,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    render_mode: str | None = None,
+    **arguments: Any,
+) -> ElasticVectorEnv:
+    """Vector entry point of `elastic_env/WalkInPlace-v0`; arguments as in `configure_walk`."""
+    _require_vector_arguments(num_envs, num_threads, render_mode)
+    config = _configure(configure_walk, "elastic_env/WalkInPlace-v0", arguments)
+    return ElasticVectorEnv(WalkTask(config, num_envs), num_threads, autoreset_mode)
+
+
+def _require_vector_arguments(num_envs: int, num_threads: int, render_mode: str | None) -> None:
     if render_mode is not None:
         raise ConfigurationError(f"the vector environment does not render, got render_mode {render_mode!r}; use None")
     if not isinstance(num_envs, int) or num_envs < 1:
         raise ConfigurationError(f"num_envs must be a whole number >= 1, got {num_envs!r}")
     if num_threads < 0:
         raise ConfigurationError(f"num_threads must be >= 0, 0 for all cores, got {num_threads}")
-    return ElasticVectorEnv(TestbedTask(_configure(arguments), num_envs), num_threads, autoreset_mode)
 
 
-def _configure(arguments: dict[str, Any]) -> TestbedConfig:
-    known = inspect.signature(configure_testbed).parameters
+def _configure(configure: Callable[..., ConfigT], environment: str, arguments: dict[str, Any]) -> ConfigT:
+    known = inspect.signature(configure).parameters
     for name in arguments:
         if name not in known:
-            raise unknown_name("argument of elastic_env/Testbed-v0", name, known)
-    return configure_testbed(**arguments)
+            raise unknown_name(f"argument of {environment}", name, known)
+    return configure(**arguments)

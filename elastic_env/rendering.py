@@ -43,6 +43,10 @@ class Picture(Protocol):
         ...
 
 
+class WalkerPicture:
+    """To come."""
+
+
 def exaggerated(angle: float, reference: float, factor: float = EXAGGERATION) -> float:
     """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
     return reference + factor * (angle - reference)

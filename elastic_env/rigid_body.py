@@ -65,14 +65,74 @@ class RigidBody:
         return full
 
 
-def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str]) -> None:
-    """Check that a rigid model moves by the named hinges and nothing else.
+class FloatingBody:
+    """A robot whose base is free and level: translation of the base and its hinges, on (..., n) arrays.
+
+    Args:
+        model: Compiled rigid model with one free joint, at its base.
+        joints: All hinges of the model, in the order of the last axis.
+
+    Raises:
+        ConfigurationError: A joint does not exist or is left out, or the base is not free.
+    """
+
+    def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
+        free = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        if len(free) != 1:
+            raise ConfigurationError(f"a floating robot needs one free joint, this model has {len(free)}")
+        require_hinge_tree(model, joints, but=free)
+        self._model = _convert(model)
+        self._data = self._model.createData()
+        base = self._model.joints[self._model.getJointId(free[0])]
+        names = [self._model.joints[self._model.getJointId(joint)] for joint in joints]
+        self._base_q, self._base_v = base.idx_q, base.idx_v
+        self._q = np.array([joint.idx_q for joint in names])
+        self._v = np.array([joint.idx_v for joint in names])
+
+    def inverse_dynamics(
+        self, q: Array, base_dot: Array, q_dot: Array, base_ddot: Array, q_ddot: Array
+    ) -> tuple[Array, Array]:
+        """What a motion needs besides gravity compensation, and gravity, without any contact.
+
+        Args:
+            q, q_dot, q_ddot: Hinges, (N, n) [rad], [rad/s], [rad/s²].
+            base_dot, base_ddot: Velocity and acceleration of the level base, (N, 3) [m/s], [m/s²].
+
+        Returns:
+            Force and moment about the origin of the base, (N, 6) [N], [N·m], and joint torques, (N, n) [N·m].
+        """
+        base_q, base_v = self._base_q, self._base_v
+        position, velocity, acceleration = np.zeros(self._model.nq), np.zeros(self._model.nv), np.zeros(self._model.nv)
+        position[base_q + 6] = 1.0  # the unit quaternion of a level base
+        wrench, torque = np.empty((len(q), 6)), np.empty(q.shape)
+        for i in range(len(q)):
+            position[self._q] = q[i]
+            velocity[base_v : base_v + 3], velocity[self._v] = base_dot[i], q_dot[i]
+            acceleration[base_v : base_v + 3], acceleration[self._v] = base_ddot[i], q_ddot[i]
+            effort = pinocchio.rnea(self._model, self._data, position, velocity, acceleration)
+            wrench[i], torque[i] = effort[base_v : base_v + 6], effort[self._v]
+        return wrench, torque
+
+    def center_of_mass(self, q: Array) -> Array:
+        """Center of mass of the whole robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
+        position = np.zeros(self._model.nq)
+        position[self._base_q + 6] = 1.0
+        com = np.empty((len(q), 3))
+        for i in range(len(q)):
+            position[self._q] = q[i]
+            com[i] = pinocchio.centerOfMass(self._model, self._data, position)
+        return com
+
+
+def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str] = ()) -> None:
+    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
-    names = [model.joint(j).name for j in range(model.njnt)]
-    for name, kind in zip(names, model.jnt_type, strict=True):
+    kinds = {model.joint(j).name: model.jnt_type[j] for j in range(model.njnt) if model.joint(j).name not in but}
+    names = list(kinds)
+    for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:
             raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; trees of hinges are needed")
     for joint in joints:
@@ -85,7 +145,7 @@ def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str]) -> None:
 
 
 def _convert(model: mujoco.MjModel) -> pinocchio.Model:
-    """Pinocchio's model of a MuJoCo tree of hinges."""
+    """Pinocchio's model of a MuJoCo tree of hinges, with or without a free base."""
     tree = pinocchio.Model()
     tree.gravity.linear = model.opt.gravity.copy()
     joint_of = {0: 0}  # MuJoCo body -> Pinocchio joint that carries it
@@ -95,6 +155,11 @@ def _convert(model: mujoco.MjModel) -> pinocchio.Model:
         T = T_joint_body[parent] * _placement(model.body_pos[b], model.body_quat[b])
         carrier = joint_of[parent]
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+            if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
+                freeflyer = pinocchio.JointModelFreeFlyer()
+                carrier = tree.addJoint(carrier, freeflyer, pinocchio.SE3.Identity(), model.joint(j).name)
+                T = pinocchio.SE3.Identity()
+                continue
             T_body_anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[j].copy())
             revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[j].copy())
             carrier = tree.addJoint(carrier, revolute, T * T_body_anchor, model.joint(j).name)

@@ -5,6 +5,7 @@ noise, encoder counts), and changes on top of either. A change alone is meant on
 on `ideal`, and changes can be joined: `soft+payload`.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -21,21 +22,43 @@ class Scenario(Model):
     stiffness_scale: float = quantity("1", 1.0, gt=0, description="true over assumed stiffness of every joint")
     friction_scale: float = quantity("1", 1.0, ge=0, description="share of the joints' friction that acts, 0 for none")
     backlash_rad: float = quantity("rad", 0.0, ge=0, description="dead band of every joint, unknown to the compensator")
-    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="true over assumed mass of the pendulum")
+    stiffness_spread: float = quantity(
+        "1", 0.0, ge=0, lt=1, description="half-width of a further factor on every joint's stiffness, drawn per robot"
+    )
+    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="testbed: true over assumed mass of the pendulum")
+    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="walker: mass on the torso, unknown to the compensator")
+    push_n: float = quantity("N", 0.0, ge=0, description="walker: force of a push on the torso, anywhere in the walk")
+    push_s: float = quantity("s", 0.1, gt=0, description="walker: duration of the push")
+    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5, description="walker: slope of the floor, in a drawn direction")
     encoder_counts: bool = True
     """Whether the encoders have whole counts."""
     encoder_bias_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the encoders' homing error")
     imu: AttitudeSensor = AttitudeSensor()
+    """IMU on the link of the testbed."""
+    pelvis_imu: AttitudeSensor = AttitudeSensor(rate_hz=500.0)
+    """IMU in the pelvis of the walker, the same for roll and pitch."""
+    gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0, description="walker: standard deviation of the gyroscope")
+    force_noise_n: float = quantity("N", 0.0, ge=0, description="walker: standard deviation of the foot forces")
+    moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
 
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
+# the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs at 500 Hz
+_PELVIS_IMU = AttitudeSensor(noise_rad=0.2e-3, rate_hz=500.0)
+# 3DM-GX4-25: 8.73e-5 rad/s/√Hz (KumarRobotics/imu_3dm_gx4) at half the control rate of 250 Hz
+_GYRO_NOISE_RAD_S = 1.0e-3
+# an assumption for the six-axis sensors of the feet, whose data were not found
+_FORCE_NOISE_N, _MOMENT_NOISE_NM = 1.0, 0.05
 # an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
 _HOMING_ERROR_RAD = 2e-3
 
 GROUNDS: dict[str, Scenario] = {
     "ideal": Scenario(name="ideal", friction_scale=0.0, encoder_counts=False),
-    "nominal": Scenario(name="nominal", imu=_IMU),
+    "nominal": Scenario(
+        name="nominal", imu=_IMU, pelvis_imu=_PELVIS_IMU, gyro_noise_rad_s=_GYRO_NOISE_RAD_S,
+        force_noise_n=_FORCE_NOISE_N, moment_noise_nm=_MOMENT_NOISE_NM,
+    ),
 }
 
 Change = Callable[[Scenario], dict[str, Any]]
@@ -43,13 +66,17 @@ Change = Callable[[Scenario], dict[str, Any]]
 CHANGES: dict[str, Change] = {
     "soft": lambda _: {"stiffness_scale": 0.7},
     "stiff": lambda _: {"stiffness_scale": 1.3},
-    "payload": lambda _: {"pendulum_mass_scale": 1.2},
+    "spread": lambda _: {"stiffness_spread": 0.3},
+    "payload": lambda _: {"pendulum_mass_scale": 1.2, "torso_load_kg": 5.0},
     "backlash": lambda _: {"backlash_rad": BACKLASH_BOUND_RAD},
     "sensor": lambda ground: {
         "encoder_bias_rad": _HOMING_ERROR_RAD,
         "imu": ground.imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
+        "pelvis_imu": ground.pelvis_imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
         "delay_steps": 1,
     },
+    "push": lambda _: {"push_n": 50.0},
+    "slope": lambda _: {"slope_rad": math.radians(1.0)},
 }
 """Parameters that a change sets on its ground."""
 

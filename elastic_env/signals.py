@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from elastic_env.errors import ConfigurationError, unknown_name
+
 Array: TypeAlias = npt.NDArray[np.floating[Any]]
 """Real numbers, float64 throughout."""
 Signals: TypeAlias = dict[str, npt.NDArray[Any]]
@@ -52,6 +54,19 @@ class SignalTable:
         if indices == list(range(indices[0], indices[0] + len(indices))):
             return slice(indices[0], indices[0] + len(indices))
         return indices
+
+    def group(self, name: str) -> slice:
+        """Where the signal of that name stands, or the signals whose names begin with it and a dot, in order.
+
+        Raises:
+            ConfigurationError: There is none, or they are not neighbours.
+        """
+        found = [i for i, own in enumerate(self.names) if own == name or own.startswith(f"{name}.")]
+        if not found:
+            raise unknown_name("signal", name, dict.fromkeys(own.split(".")[0] for own in self.names))
+        if found != list(range(found[0], found[-1] + 1)):
+            raise ConfigurationError(f"the columns of {name!r} must be neighbours, they are {found}")
+        return slice(found[0], found[-1] + 1)
 
     def space(self, dtype: type[np.float32] | type[np.float64]) -> Any:
         """The Gymnasium space of one world."""

@@ -3,6 +3,7 @@
 Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control period are one call.
 """
 
+import copy
 import os
 from typing import Any, Protocol
 
@@ -23,8 +24,24 @@ class Simulation(Protocol):
     act: Array
     ctrl: Array
 
+    def bind(self, field: str) -> Array:
+        """A live (num_worlds, ...) view of a field of `MjData`.
+
+        Inputs such as `xfrc_applied` can be written. Derived fields and sensors lag one physics step behind the state,
+        as after `mj_step`.
+        """
+        ...
+
+    def vary(self, field: str) -> Array:
+        """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now on."""
+        ...
+
     def advance(self, num_substeps: int) -> None:
         """Step every world by `num_substeps` physics steps under its current `ctrl`."""
+        ...
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """Compute derived fields and sensors of the present state in some worlds, a (num_worlds,) mask."""
         ...
 
     def restart(self, worlds: BoolArray) -> None:
@@ -42,14 +59,26 @@ class SingleWorld:
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
         self.num_worlds = 1
+        self._varies = False
         self._data = mujoco.MjData(model)
         self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
         self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SingleWorld":
-        copied = SingleWorld(self.model)
+        copied = SingleWorld(copy.copy(self.model) if self._varies else self.model)
+        copied._varies = self._varies
         mujoco.mj_copyData(copied._data, self.model, self._data)
         return copied
+
+    def bind(self, field: str) -> Array:
+        """See `Simulation`."""
+        return getattr(self._data, field)[None]
+
+    def vary(self, field: str) -> Array:
+        """See `Simulation`."""
+        if not self._varies:
+            self.model, self._varies = copy.copy(self.model), True
+        return getattr(self.model, field)[None]
 
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""
@@ -59,6 +88,11 @@ class SingleWorld:
         """See `Simulation`."""
         if worlds[0]:
             mujoco.mj_resetData(self.model, self._data)
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """See `Simulation`."""
+        if worlds[0]:
+            mujoco.mj_forward(self.model, self._data)
 
     def diverged(self) -> BoolArray:
         """See `Simulation`."""
@@ -71,15 +105,27 @@ class ManyWorlds:
     def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> None:
         self.model = model
         self.num_worlds = num_worlds
+        self._varied: set[str] = set()
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=min(num_threads or os.cpu_count() or 1, num_worlds))
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ManyWorlds":
         copied = ManyWorlds(self.model, self.num_worlds, self._batch.nthread)
+        for field in self._varied:
+            copied.vary(field)[:] = self.vary(field)
         copied._batch.state[:] = self._batch.state
         copied._batch.warning[:] = self._batch.warning
         return copied
+
+    def bind(self, field: str) -> Array:
+        """See `Simulation`."""
+        return self._batch.bind(field)
+
+    def vary(self, field: str) -> Array:
+        """See `Simulation`."""
+        self._varied.add(field)
+        return self._batch.expand(field)
 
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""
@@ -89,6 +135,11 @@ class ManyWorlds:
         """See `Simulation`."""
         if worlds.any():
             self._batch.reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """See `Simulation`."""
+        if worlds.any():
+            self._batch.forward(worlds)
 
     def diverged(self) -> BoolArray:
         """See `Simulation`."""

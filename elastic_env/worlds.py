@@ -67,21 +67,28 @@ class Worlds:
         requested = self._checked(action)
         offset = np.clip(requested, -self._bound, self._bound)
         self.simulation.ctrl[:] = self.task.command(offset)
+        self.task.disturb(self.simulation)
         self.simulation.advance(self.task.num_substeps)
         diverged = self.simulation.diverged()
         self.task.sense(self.simulation)
         signals = self.task.signals()
         signals["clipped"] = (requested != offset).any(axis=1).astype(np.float64)
-        self._metrics.update(signals, self.task.scored() & ~diverged)
+        self._metrics.update(signals, self._masks(diverged))
         terms = self.task.reward_terms(signals, diverged)
         failures = {DIVERGED: diverged, **self.task.failures()}
         terminated = np.logical_or.reduce(list(failures.values()))
         truncated = self.task.finished() & ~terminated
         info: dict[str, Any] = {**signals, "reward_terms": terms, "termination": _reasons(failures, self.num_worlds)}
         if (terminated | truncated).any():
-            info["episode_metrics"] = {**self._metrics.values(), DIVERGED: diverged.copy()}
+            info["episode_metrics"] = {**self._metrics.values(), **{name: mask.copy() for name, mask in failures.items()}}
         reward = np.sum(list(terms.values()), axis=0)
         return Transition(self.task.observe(), reward, terminated, truncated, info)
+
+    def _masks(self, diverged: BoolArray) -> dict[str, BoolArray]:
+        """Where the metrics take samples, by name."""
+        scored, healthy = self.task.scored(), ~diverged
+        masks = {"all": np.ones_like(diverged), "scored": scored & healthy}
+        return masks | {name: mask & masks["scored"] for name, mask in self.task.masks().items()}
 
     def _checked(self, action: npt.ArrayLike) -> Array:
         values = np.asarray(action, dtype=np.float64)

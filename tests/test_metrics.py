@@ -1,5 +1,7 @@
 """Running statistics against NumPy on the recorded samples."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,10 +17,11 @@ STATISTICS = {
     "min": np.min,
     "max": np.max,
     "peak": lambda x: np.abs(x).max(),
+    "count": len,
 }
 METRICS = [Metric(f"x_{s}_rad", "x", s) for s in STATISTICS] + [  # type: ignore[arg-type]
-    Metric("y_rms_rad", "y", "rms", scored_only=False),
-    Metric("x_all_mean_rad", "x", "mean", scored_only=False),
+    Metric("y_rms_rad", "y", "rms", over="all"),
+    Metric("x_all_mean_rad", "x", "mean", over="all"),
 ]
 
 logs = st.tuples(st.integers(1, 12), st.integers(1, 4)).flatmap(
@@ -29,18 +32,23 @@ logs = st.tuples(st.integers(1, 12), st.integers(1, 4)).flatmap(
 )
 
 
+def masks(scored: Sequence[bool] | BoolArray) -> dict[str, BoolArray]:
+    """Masks of a step."""
+    return {"scored": np.array(scored, dtype=bool), "all": np.ones(len(scored), dtype=bool)}
+
+
 @given(log=logs)
 def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray]) -> None:
     """Catches a statistic under the wrong name, samples of other worlds, and zero where nothing was sampled."""
     values, sampled = log
-    running = RunningStatistics(["x"], values.shape[1])
+    running = RunningStatistics(1, values.shape[1])
     for row, mask in zip(values, sampled, strict=True):
-        running.update({"x": row}, mask)
+        running.update(row[None], mask[None])
     for name, function in STATISTICS.items():
-        result = running.statistic(Metric("m", "x", name))  # type: ignore[arg-type]
+        result = running.statistic(name, 0)
         for world in range(values.shape[1]):
             chosen = values[sampled[:, world], world]
-            expected = function(chosen) if len(chosen) else np.nan
+            expected = function(chosen) if len(chosen) or name == "count" else np.nan
             np.testing.assert_allclose(result[world], expected, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
@@ -48,7 +56,7 @@ def test_scored_and_all_steps_are_kept_apart() -> None:
     """Catches a metric of all steps that leaves out the standing, and one of scored steps that does not."""
     metrics = EpisodeMetrics(METRICS, 1)
     for k, scored in enumerate([False, True, True, False]):
-        metrics.update({"x": np.array([float(k)]), "y": np.array([-2.0 * k])}, np.array([scored]))
+        metrics.update({"x": np.array([float(k)]), "y": np.array([-2.0 * k])}, masks([scored]))
     values = {name: value[0] for name, value in metrics.values().items()}
     assert list(values) == [metric.name for metric in METRICS]
     assert (values["x_mean_rad"], values["x_min_rad"], values["x_max_rad"]) == (1.5, 1.0, 2.0)
@@ -60,10 +68,10 @@ def test_an_episode_begins_without_the_samples_of_the_last_one() -> None:
     """Catches a restart that forgets only the sums, or that forgets the other worlds too."""
     metrics = EpisodeMetrics(METRICS, 2)
     everyone = np.ones(2, dtype=bool)
-    metrics.update({"x": np.array([-7.0, -7.0]), "y": np.zeros(2)}, everyone)
+    metrics.update({"x": np.array([-7.0, -7.0]), "y": np.zeros(2)}, masks(everyone))
     metrics.restart(np.array([True, False]))
     assert np.isnan(metrics.values()["x_peak_rad"][0])
-    metrics.update({"x": np.array([3.0, 3.0]), "y": np.zeros(2)}, everyone)
+    metrics.update({"x": np.array([3.0, 3.0]), "y": np.zeros(2)}, masks(everyone))
     values = metrics.values()
     np.testing.assert_array_equal(values["x_peak_rad"], [3.0, 7.0])
     np.testing.assert_array_equal(values["x_min_rad"], [3.0, -7.0])
@@ -74,7 +82,7 @@ def test_an_episode_begins_without_the_samples_of_the_last_one() -> None:
 def test_values_do_not_share_memory_with_what_comes_later() -> None:
     """Catches metrics of an ended episode that change while the next one runs."""
     metrics = EpisodeMetrics(METRICS, 1)
-    metrics.update({"x": np.ones(1), "y": np.ones(1)}, np.ones(1, dtype=bool))
+    metrics.update({"x": np.ones(1), "y": np.ones(1)}, masks([True]))
     values = metrics.values()
-    metrics.update({"x": np.full(1, 9.0), "y": np.ones(1)}, np.ones(1, dtype=bool))
+    metrics.update({"x": np.full(1, 9.0), "y": np.ones(1)}, masks([True]))
     assert all(value[0] == 1.0 for value in values.values())

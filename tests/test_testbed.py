@@ -469,7 +469,7 @@ def test_episode_metrics_are_those_of_the_recorded_signals(reference: str) -> No
     assert metrics.pop("diverged") is False
     assert set(metrics) == {metric.name for metric in env.task.metrics}
     for metric in env.task.metrics:
-        values = recorded[metric.signal][scored if metric.scored_only else slice(None)]
+        values = recorded[metric.signal][scored if metric.over == "scored" else slice(None)]
         assert metrics[metric.name] == pytest.approx(statistics[metric.statistic](values), rel=1e-9, abs=1e-15), metric
 
 

@@ -1,8 +1,8 @@
 """What a compensator may know of a robot: its rigid model and the parameters of its elastic joints."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -12,6 +12,8 @@ import numpy.typing as npt
 from elastic_env.elasticity import ElasticJoint, Servo
 from elastic_env.errors import ConfigurationError
 from elastic_env.signals import NO_SIGNALS, Array, SignalTable
+from elastic_env.walking.biped import Biped
+from elastic_env.walking.walk_plan import WalkPlan
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Where an identification file holds K."""
@@ -66,6 +68,11 @@ class RobotModel:
         return self._values("viscous_friction")
 
     @property
+    def encoder_counts_per_turn(self) -> int | None:
+        """Counts of the encoders, which are all alike; None for continuous ones."""
+        return next(iter(self.joints.values())).encoder_counts_per_turn
+
+    @property
     def servos(self) -> tuple[Servo, ...]:
         """The servos of the joints.
 
@@ -83,26 +90,44 @@ class RobotModel:
         Raises:
             ConfigurationError: The number of values does not fit, or one is not positive and finite.
         """
-        values = np.asarray(stiffness, dtype=np.float64)
-        if values.shape not in {(), (len(self.joints),)}:
-            raise ConfigurationError(
-                f"stiffness must be one number or {len(self.joints)} of them [N·m/rad], one per joint "
-                f"({', '.join(self.joints)}), got an array of shape {values.shape}"
-            )
-        each = np.broadcast_to(values, (len(self.joints),))
-        joints = {n: j.replace(stiffness=float(k)) for (n, j), k in zip(self.joints.items(), each, strict=True)}
-        return replace(self, joints=joints)
+        return replace(self, joints=with_stiffness(self.joints, stiffness))
 
     def _values(self, parameter: str) -> Array:
         return np.array([getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64)
 
 
-def read_stiffness(value: float | str | Path) -> float:
-    """A stiffness given as a number or as the file that `elastic identify` writes [N·m/rad].
+def with_stiffness(joints: Mapping[str, ElasticJoint], stiffness: npt.ArrayLike) -> dict[str, ElasticJoint]:
+    """Joints with another stiffness, one number for all or one per joint [N·m/rad].
+
+    Raises:
+        ConfigurationError: The number of values does not fit, or one is not positive and finite.
+    """
+    values = np.asarray(stiffness, dtype=np.float64)
+    if values.shape not in {(), (len(joints),)}:
+        raise ConfigurationError(
+            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per joint "
+            f"({', '.join(joints)}), got an array of shape {values.shape}"
+        )
+    each = np.broadcast_to(values, (len(joints),))
+    return {name: j.replace(stiffness=float(k)) for (name, j), k in zip(joints.items(), each, strict=True)}
+
+
+@dataclass(frozen=True)
+class WalkerModel(RobotModel):
+    """What is known of a walker: also its legs and the walk that it is to do."""
+
+    biped: Biped = field(kw_only=True)
+    plan: WalkPlan = field(kw_only=True)
+
+
+def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "float | Array":
+    """A stiffness given as a number, as one per joint, or as the file that `elastic identify` writes [N·m/rad].
 
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
+    if isinstance(value, list | tuple | np.ndarray):
+        return np.asarray(value, dtype=np.float64)
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {value!r}")
     try:

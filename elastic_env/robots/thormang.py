@@ -13,7 +13,9 @@ forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs. 
 """
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import resources
 
 import mujoco
@@ -22,7 +24,9 @@ import numpy as np
 from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint
 from elastic_env.robots.dynamixel import H54_200_S500_R
+from elastic_env.robots.elastic_joint import Form, make_elastic
 from elastic_env.signals import Array
+from elastic_env.walking.biped import Biped
 from elastic_env.walking.leg_kinematics import JOINTS, LegGeometry
 
 SIDES = ("l", "r")
@@ -53,6 +57,13 @@ class Thormang(Model):
         return {
             name: _twin(H54_200_S500_R) if self.twin_knee and "knee" in name else H54_200_S500_R for name in LEG_JOINTS
         }
+
+
+@lru_cache(maxsize=8)
+def biped(robot: Thormang) -> Biped:
+    """The robot as gait and controller see it."""
+    hips = np.array([[0.0, robot.hip_half_spacing, 0.0], [0.0, -robot.hip_half_spacing, 0.0]])
+    return Biped(rigid_spec(robot).compile(), LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M)
 
 
 @dataclass(frozen=True)
@@ -105,7 +116,27 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
+    floor = spec.worldbody.add_body(name="floor")  # a body of its own, so that it can be tilted
+    floor.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
+    return spec
+
+
+def elastic_spec(
+    robot: Thormang, joints: Mapping[str, ElasticJoint], form: Form = "tendon", timestep_s: float = 1e-3
+) -> mujoco.MjSpec:
+    """The robot with elastic leg joints, their servos, and force-torque sensors at the ankles.
+
+    Args:
+        robot: Options.
+        joints: Parameters of the leg joints by name.
+        form: "tendon", or "rigid" for what an inelastic robot would do.
+        timestep_s: Physics step [s].
+    """
+    spec = make_elastic(rigid_spec(robot), joints, form, actuators="replace")
+    spec.option.timestep = timestep_s
+    for side in SIDES:
+        for kind, name in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):
+            spec.add_sensor(name=f"{side}_{name}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{side}_ft")
     return spec
 
 

@@ -15,7 +15,7 @@ from elastic_env.simulation import Simulation
 class Task(Protocol):
     """Rules of an environment, driven by `elastic_env.worlds.Worlds` in this order every control step.
 
-    command → (physics) → sense → signals, scored, reward_terms, failures, finished → observe
+    command → disturb → (physics) → sense → signals, scored, reward_terms, failures, finished → observe
     """
 
     model: mujoco.MjModel
@@ -39,6 +39,10 @@ class Task(Protocol):
         """Servo inputs for command offsets, (num_worlds, n) [rad], already within bounds; ctrl, (num_worlds, nu)."""
         ...
 
+    def disturb(self, simulation: Simulation) -> None:
+        """Apply what acts on the robot from outside during the coming control period."""
+        ...
+
     def sense(self, simulation: Simulation) -> None:
         """Take truth and measurements of the new state; worlds that diverged keep their last ones."""
         ...
@@ -57,6 +61,10 @@ class Task(Protocol):
 
     def scored(self) -> BoolArray:
         """Worlds whose present step counts in the metrics."""
+        ...
+
+    def masks(self) -> dict[str, BoolArray]:
+        """Further masks that the metrics name, parts of `scored`."""
         ...
 
     def finished(self) -> BoolArray:

@@ -54,9 +54,9 @@ METRICS = (
     *(Metric(f"link_error_imu_{s}_rad", "link_error_imu", s) for s in ("rms", "min", "max")),
     *(Metric(f"deflection_{s}_rad", "deflection", s) for s in ("rms", "peak")),
     *(Metric(f"servo_error_{s}_rad", "servo_error", s) for s in ("rms", "peak")),
-    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, scored_only=False) for s in ("rms", "peak")),
-    Metric("joint_torque_peak_nm", "joint_torque", "peak", scored_only=False),
-    Metric("clipped_share", "clipped", "mean", scored_only=False),
+    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, over="all") for s in ("rms", "peak")),
+    Metric("joint_torque_peak_nm", "joint_torque", "peak", over="all"),
+    Metric("clipped_share", "clipped", "mean", over="all"),
 )
 
 
@@ -147,6 +147,9 @@ class TestbedTask:
         self._command = self._reference.at(self._step + 1).q + self._offset
         return (self._command - self._encoder_bias)[:, None]
 
+    def disturb(self, simulation: Simulation) -> None:
+        """Nothing pushes the testbed."""
+
     def sense(self, simulation: Simulation) -> None:
         """Read the new state, then what the sensors show of it."""
         self._step += 1
@@ -195,6 +198,10 @@ class TestbedTask:
     def scored(self) -> BoolArray:
         """Windows at rest of `hold`; all but standing and onset of the other references."""
         return self._reference.at(self._step).scored
+
+    def masks(self) -> dict[str, BoolArray]:
+        """None besides those of every task."""
+        return {}
 
     def finished(self) -> BoolArray:
         """The reference has come to its end."""

@@ -1,0 +1,230 @@
+r"""Joint torques of a walker at rest on its feet: Eqs. 4 to 6 of the paper, and from measured foot wrenches.
+
+The paper takes τ_g = J_r^T F_r + J_l^T F_l with Jacobians from the center of mass to the contact points. Where the
+contact point is, and what of the robot has mass, is chosen by name:
+
+| name | contact | masses |
+|---|---|---|
+| `com` | at the ZMP, each foot's share at a point of its own (`elastic_env.walking.contact_force`) | all links |
+| `ankle` | at the ankle axes, so that no ankle carries torque | all links |
+| `lumped` | at the ankle axes | all in the pelvis; the legs weigh nothing, as in published code |
+
+In single support over its foot, `com` is the exact multibody torque.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from elastic_env.elasticity import solve_stiffness
+from elastic_env.robots.robot_model import WalkerModel
+from elastic_env.signals import Array
+from elastic_env.walking.contact_force import shares
+from elastic_env.walking.leg_chains import LegFrames, cross, holding_torque, holding_torque_gradient
+
+ContactMethod = Literal["com", "ankle", "lumped"]
+
+_LEGS, _PER_LEG = 2, 6
+
+
+def gravity_in_pelvis(attitude: Array, gravity: float) -> Array:
+    """Acceleration of gravity in the frame of a pelvis with roll and pitch, (..., 2) [rad] to (..., 3) [m/s²]."""
+    roll, pitch = attitude[..., 0], attitude[..., 1]
+    down = [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
+    return -gravity * np.stack(down, axis=-1)
+
+
+class ContactGravity:
+    """Gravity torque of a walker under the planned load share, by one of the methods of the module.
+
+    Args:
+        model: Assumed walker.
+        method: "com", "ankle" or "lumped".
+    """
+
+    def __init__(self, model: WalkerModel, method: ContactMethod = "com") -> None:
+        self._model, self._method = model, method
+        table, biped = model.observation_table, model.biped
+        self._share, self._zmp = table.group("load_share"), table.group("zmp_reference")
+        self._attitude = table.group("imu_attitude")
+        self._down = np.array([0.0, 0.0, -biped.gravity])
+
+    def at(self, rows: Array, level: bool = True) -> "BoundContactGravity":
+        """The gravity torque under the load share of observations, (num_worlds, m).
+
+        Args:
+            rows: Observations.
+            level: Whether the pelvis is level, as commanded, or tilted as the IMU says.
+        """
+        biped = self._model.biped
+        weights = shares(rows[:, self._share][:, 0])
+        rest = rows[:, self._zmp] - weights @ biped.footholds  # of the ZMP from the feet's weighted middle
+        in_sole = np.zeros((len(rows), _LEGS, 3))
+        if self._method == "com":
+            in_sole[..., :2] = rest[:, None]
+            in_sole[..., 2] = -biped.ankle_height
+        gravity = self._down if level else gravity_in_pelvis(rows[:, self._attitude], biped.gravity)
+        return BoundContactGravity(self._model, weights, in_sole, gravity, self._method != "lumped")
+
+
+class BoundContactGravity:
+    """Gravity torque of a walker whose feet share the weight in a given way; a `GravityModel` on (num_worlds, 12)."""
+
+    def __init__(self, model: WalkerModel, weights: Array, in_sole: Array, gravity: Array, legs_weigh: bool) -> None:
+        self._chains, self._weights, self._in_sole = model.biped.chains, weights, in_sole
+        self._gravity, self._legs_weigh = gravity, legs_weigh
+        self._force = -model.biped.chains.mass * weights[..., None] * np.expand_dims(np.atleast_2d(gravity), -2)
+        self._frames = _Memo(self._chains)
+
+    def gravity_torque(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        frames = self._weighing(q)
+        torque = holding_torque(frames, self._gravity, self._force, self._points(frames))
+        return torque.reshape(q.shape)
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """See `GravityModel`; the legs do not couple."""
+        frames = self._weighing(q)
+        return _block_diagonal(holding_torque_gradient(frames, self._gravity, self._force, self._points(frames)))
+
+    def solve(self, q: Array, stiffness: Array, torque: Array) -> Array:
+        """(K + ∂τ_g/∂q)⁻¹ τ leg by leg, (num_worlds, 12)."""
+        frames = self._weighing(q)
+        gradient = holding_torque_gradient(frames, self._gravity, self._force, self._points(frames))
+        return _solve_by_leg(gradient, stiffness, torque)
+
+    def _weighing(self, q: Array) -> LegFrames:
+        frames = self._frames.at(q)
+        if self._legs_weigh:
+            return frames
+        return LegFrames(frames.axes, frames.anchors, np.zeros_like(frames.levers), frames.foot_R, frames.com)
+
+    def _points(self, frames: LegFrames) -> Array:
+        return frames.ankle + (frames.foot_R * self._in_sole[..., None, :]).sum(axis=-1)
+
+
+class WrenchTorque:
+    """Torque of a walker's joints from the measured foot wrenches and the weight of its legs.
+
+    Args:
+        model: Assumed walker.
+    """
+
+    def __init__(self, model: WalkerModel) -> None:
+        self._model = model
+        table = model.observation_table
+        self._wrench, self._attitude = table.group("wrench"), table.group("imu_attitude")
+
+    def at(self, rows: Array, level: bool = False) -> "BoundWrenchTorque":
+        """The torque under the wrenches of observations, (num_worlds, m); `level` as in `ContactGravity.at`."""
+        gravity = self._model.biped.gravity
+        attitude = np.zeros((len(rows), 2)) if level else rows[:, self._attitude]
+        wrench = rows[:, self._wrench].reshape(-1, _LEGS, 2, 3)
+        return BoundWrenchTorque(self._model, wrench, gravity_in_pelvis(attitude, gravity))
+
+
+class BoundWrenchTorque:
+    """Joint torques under wrenches that are known in the frames of the feet; a `GravityModel` on (num_worlds, 12)."""
+
+    def __init__(self, model: WalkerModel, wrench: Array, gravity: Array) -> None:
+        self._chains, self._wrench, self._gravity = model.biped.chains, wrench, gravity
+        self._frames = _Memo(self._chains)
+
+    def gravity_torque(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        frames = self._frames.at(q)
+        force, moment = self._force_and_moment(frames)
+        load = cross(frames.levers, self._gravity[..., None, None, :])
+        load = load + cross(frames.ankle[..., None, :] - frames.anchors, force[..., None, :]) + moment[..., None, :]
+        return -(frames.axes * load).sum(axis=-1).reshape(q.shape)
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """See `GravityModel`; not symmetric, since the wrench turns with its foot."""
+        return _block_diagonal(self._gradient(q))
+
+    def solve(self, q: Array, stiffness: Array, torque: Array) -> Array:
+        """(K + ∂τ/∂q)⁻¹ τ leg by leg, (num_worlds, 12)."""
+        return _solve_by_leg(self._gradient(q), stiffness, torque)
+
+    def _gradient(self, q: Array) -> Array:
+        frames = self._frames.at(q)
+        zero = np.zeros((*q.shape[:-1], _LEGS, 3))
+        legs = holding_torque_gradient(frames, self._gravity, zero, zero)
+        force, moment = self._force_and_moment(frames)
+        arm = frames.ankle[..., None, :] - frames.anchors
+        turned_arm = cross(frames.axes, arm)
+        turned_force = cross(frames.axes, force[..., None, :])
+        turned_moment = cross(frames.axes, moment[..., None, :])
+        own = cross(turned_arm, force[..., None, :]) + turned_moment
+        # joint j beyond i turns the foot under joint i: its arm, its force and its moment; before i all turn together
+        product = frames.axes @ own.swapaxes(-1, -2)
+        product = product + cross(frames.axes, arm) @ turned_force.swapaxes(-1, -2)
+        return legs - np.triu(product, 1)
+
+    def _force_and_moment(self, frames: LegFrames) -> tuple[Array, Array]:
+        force = (frames.foot_R * self._wrench[..., 0, None, :]).sum(axis=-1)
+        moment = (frames.foot_R * self._wrench[..., 1, None, :]).sum(axis=-1)
+        return force, moment
+
+
+class PlannedTorque:
+    """Torque of the planned motion by inverse dynamics, and the static torque of what is commanded beside it.
+
+    Args:
+        model: Assumed walker.
+        gravity: Static torque.
+    """
+
+    def __init__(self, model: WalkerModel, gravity: ContactGravity) -> None:
+        self._model, self._gravity = model, gravity
+        self._time = model.observation_table.group("clock")
+        self._reference = model.observation_table.group("reference_angle")
+
+    def at(self, rows: Array) -> "BoundPlannedTorque":
+        """The torque at the control steps of observations, (num_worlds, m)."""
+        plan = self._model.plan
+        row = np.round(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
+        torque = plan.torque[np.clip(row, 0, plan.num_steps)]
+        return BoundPlannedTorque(torque, rows[:, self._reference], self._gravity.at(rows))
+
+
+@dataclass(frozen=True)
+class BoundPlannedTorque:
+    """Torque of a planned control step; `inverse_dynamics` as that of a `RigidBody`."""
+
+    torque: Array
+    q_ref: Array
+    gravity: BoundContactGravity
+
+    def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  the interface's
+        """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
+        if np.array_equal(q, self.q_ref):
+            return self.torque
+        return self.torque + self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
+
+
+class _Memo:
+    """Frames of the last joint angles: torque and gradient are asked for at the same ones."""
+
+    def __init__(self, chains) -> None:
+        self._chains, self._q, self._frames = chains, None, None
+
+    def at(self, q: Array) -> LegFrames:
+        if self._frames is None or self._q is not q:
+            self._q, self._frames = q, self._chains.frames(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
+        return self._frames
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    """(..., L, J, J) to (..., L J, L J)."""
+    L, J = blocks.shape[-3:-1]
+    full = np.zeros((*blocks.shape[:-3], L * J, L * J))
+    for leg in range(L):
+        full[..., leg * J : (leg + 1) * J, leg * J : (leg + 1) * J] = blocks[..., leg, :, :]
+    return full
+
+
+def _solve_by_leg(gradient: Array, stiffness: Array, torque: Array) -> Array:
+    K = np.broadcast_to(stiffness, torque.shape).reshape(*torque.shape[:-1], _LEGS, _PER_LEG)
+    return solve_stiffness(K, gradient, torque.reshape(K.shape)).reshape(torque.shape)

@@ -1,0 +1,177 @@
+r"""The walking controller: foot force difference control, and feedback of the center of mass from joint angles.
+
+It commands offsets of the joints around the planned walk. Where a joint is, it takes from the encoder columns of the
+observation, so that an output compensator around it (`baselines.Compensated`) shows it links instead of motors.
+
+Local frame: at the sole of the step's support foot, level, its place in the plan's world that of the planned foothold,
+re-taken at every support change. The center of mass in it follows from joint angles and the attitude of the IMU.
+
+[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS: foot force
+difference control, and the ZMP from the divergent component of motion ξ = c + ċ/ω.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from baselines.policy import Action, ObservationView, resume
+from elastic_env.config import Model, quantity
+from elastic_env.plan import STAND_S, quintic
+from elastic_env.robots.robot_model import WalkerModel
+from elastic_env.signals import Array
+from elastic_env.walking.biped import Biped
+from elastic_env.walking.contact_force import shares
+from elastic_env.walking.gait import LEFT, RIGHT
+from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+
+
+class WalkingGains(Model):
+    """Gains of the walking controller."""
+
+    force_difference: float = quantity("m/(N·s)", 1e-4, ge=0, description="leg length difference per force difference")
+    force_difference_decay_s: float = quantity("s", 1.0, gt=0, description="time constant of its decay")
+    force_difference_limit_m: float = quantity("m", 0.04, gt=0, description="largest difference of the leg lengths")
+    dcm: float = quantity("1", 0.5, ge=0, description="ZMP shift per error of the divergent component of motion")
+    zmp_limit_m: float = quantity("m", 0.06, gt=0, description="largest ZMP shift")
+    velocity_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the COM velocity")
+    zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """Center of mass and feet as a controller sees them, level and relative to the pelvis, one row per world.
+
+    Attributes:
+        com: Center of mass, (num_worlds, 3) [m].
+        soles: Middles of the soles, (num_worlds, 2, 3) [m].
+    """
+
+    com: Array
+    soles: Array
+
+    def com_in(self, foot: Array) -> Array:
+        """Center of mass relative to the sole of a foot of every world, (num_worlds, 3) [m]."""
+        return self.com - self.soles[np.arange(len(foot)), foot]
+
+
+def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
+    """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2) [rad]."""
+    frames = biped.chains.frames(q.reshape(len(q), 2, -1))
+    R = rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])
+    soles = frames.ankle - biped.ankle_height * frames.foot_R[..., 2]
+    return LocalFrame((R @ frames.com[..., None])[..., 0], soles @ R.swapaxes(-1, -2))
+
+
+class WalkingController:
+    """Commands a walker around its plan, see the module.
+
+    Memory per world: steps, leg length difference, COM relative to both feet, COM velocity, ZMP shift.
+
+    Args:
+        model: Assumed walker.
+        com_feedback: Whether the COM is fed back; force difference control always acts.
+        gains: Gains.
+        ramp_s: Time in which the feedback grows from zero [s].
+    """
+
+    def __init__(
+        self,
+        model: WalkerModel,
+        com_feedback: bool = True,
+        gains: WalkingGains | None = None,
+        ramp_s: float = STAND_S,
+    ) -> None:
+        self._model, self._biped, self._plan = model, model.biped, model.plan
+        self._com_feedback, self._gains = com_feedback, gains or WalkingGains()
+        table = model.observation_table
+        self._view = ObservationView(table)
+        self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
+        self._clock, self._share = table.group("clock"), table.group("load_share")
+        self._dt = model.control_period_s
+        self._ramp_steps = max(round(ramp_s / self._dt), 1)
+        stiffness = model.stiffness.reshape(2, 6)
+        self._ankle_stiffness = stiffness[:, 4:]
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True  # noqa: ARG002
+    ) -> tuple[Action, Any]:
+        """Offsets of the twelve joints [rad], and new state."""
+        rows = self._view.rows(observation)
+        frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
+        memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
+        steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
+        steps = steps + 1.0
+        share, _, _ = quintic(steps / self._ramp_steps)
+        z = self._leg_difference(rows, z)
+        coms = (frame.com[:, None] - frame.soles)[..., :2]
+        if self._com_feedback:
+            velocity, shift = self._zmp_shift(rows, coms, last.reshape(coms.shape), velocity, shift)
+        action = share * (self._leg_offsets(rows, z) + self._ankle_offsets(rows, shift))
+        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift])
+        action = action.astype(np.float32)
+        return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
+        """The encoder angles, (..., 12) [rad]: without an output compensator it takes motors for links."""
+        rows = self._view.rows(observation)
+        return self._view.theta(rows).reshape((*observation.shape[:-1], -1))
+
+    def _begin(self, frame: LocalFrame) -> Array:
+        coms = (frame.com[:, None] - frame.soles)[..., :2].reshape(len(frame.com), 4)
+        zero = np.zeros((len(coms), 1))
+        return np.hstack([zero, zero, coms, zero, zero, zero, zero])
+
+    def _leg_difference(self, rows: Array, z: Array) -> Array:
+        """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
+        gains = self._gains
+        weight = self._biped.weight
+        vertical = self._vertical_forces(rows)
+        desired = (1.0 - 2.0 * rows[:, self._share]) * weight
+        missing = desired - (vertical[:, [LEFT]] - vertical[:, [RIGHT]])
+        z = z + self._dt * (gains.force_difference * missing - z / gains.force_difference_decay_s)
+        return np.clip(z, -gains.force_difference_limit_m, gains.force_difference_limit_m)
+
+    def _vertical_forces(self, rows: Array) -> Array:
+        """Along the legs' soles, which are nearly level, (num_worlds, 2) [N]."""
+        return rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2]
+
+    def _zmp_shift(self, rows: Array, coms: Array, last: Array, velocity: Array, shift: Array) -> tuple[Array, Array]:
+        """Filtered COM velocity and ZMP shift, (num_worlds, 2) each [m/s], [m]."""
+        gains, plan = self._gains, self._plan
+        worlds, support = np.arange(len(rows)), rows[:, self._clock][:, 2].astype(np.int64)
+        row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, plan.num_steps)
+        com = coms[worlds, support] + self._biped.footholds[support]
+        change = (coms - last)[worlds, support] / self._dt
+        velocity = velocity + _share(self._dt, gains.velocity_filter_s) * (change - velocity)
+        omega = plan.omega
+        error = com + velocity / omega - plan.com[row] - plan.com_dot[row] / omega
+        wanted = np.clip(gains.dcm * error, -gains.zmp_limit_m, gains.zmp_limit_m)
+        return velocity, shift + _share(self._dt, gains.zmp_filter_s) * (wanted - shift)
+
+    def _leg_offsets(self, rows: Array, z: Array) -> Array:
+        """Offsets that lengthen the left leg by z/2 and shorten the right one, (num_worlds, 12) [rad]."""
+        leg = self._biped.leg
+        knee = self._view.motion(rows).q.reshape(-1, 2, 6)[..., 3]
+        distance = np.sqrt(leg.thigh**2 + leg.shank**2 + 2.0 * leg.thigh * leg.shank * np.cos(knee))
+        bend = -distance / (leg.thigh * leg.shank * np.sin(knee)) * (0.5 * np.array([1.0, -1.0]) * z)
+        # the ankle stays on the line from the hip, and the sole keeps its attitude
+        at_hip = -bend * leg.shank * (leg.shank + leg.thigh * np.cos(knee)) / distance**2
+        offsets = np.zeros((len(rows), 2, 6))
+        offsets[..., 3] = bend
+        offsets[..., 2] = at_hip
+        offsets[..., 4] = -bend - at_hip
+        return offsets.reshape(len(rows), 12)
+
+    def _ankle_offsets(self, rows: Array, shift: Array) -> Array:
+        """Offsets that wind the ankle springs by the torque of a ZMP shift, (num_worlds, 12) [rad]."""
+        carried = shares(rows[:, self._share][:, 0]) * self._biped.weight
+        offsets = np.zeros((len(rows), 2, 6))
+        offsets[..., 4] = carried * shift[:, [0]] / self._ankle_stiffness[:, 0]
+        offsets[..., 5] = -carried * shift[:, [1]] / self._ankle_stiffness[:, 1]
+        return offsets.reshape(len(rows), 12)
+
+
+def _share(period_s: float, time_constant_s: float) -> float:
+    """Share of a step that a first-order filter makes in one period."""
+    return 1.0 - float(np.exp(-period_s / time_constant_s))

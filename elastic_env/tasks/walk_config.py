@@ -1,0 +1,101 @@
+"""Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
+
+from typing import Literal
+
+import mujoco
+import numpy as np
+from pydantic import Field
+
+from elastic_env.config import Model, quantity
+from elastic_env.elasticity import ElasticJoint
+from elastic_env.robots.thormang import LEG_JOINTS, Thormang, elastic_spec
+from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.walking.gait import Gait
+
+FALL_HEIGHT_SHARE = 0.75
+"""A pelvis below this share of its planned height has fallen."""
+FALL_TILT_RAD = 0.4
+"""A pelvis tilted by more than this has fallen [rad]."""
+
+
+class WalkRewardWeights(Model):
+    """Weights of the reward terms; every term is a penalty that grows without saturating."""
+
+    tilt: float = quantity("1/rad", 100.0, ge=0, description="per rad of pelvis error: 1 at 0.01 rad")
+    zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, description="per m of ZMP deviation: 1 at 0.03 m")
+    effort: float = quantity("1/(N·m)", 0.001, ge=0, description="per N·m of servo torque, rms over the joints")
+    smoothness: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offsets, rms over joints")
+    fall: float = quantity("1", 200.0, ge=0, description="once, at a fall or where the simulation diverges")
+
+
+class WalkConfig(Model):
+    """All of the walking environment."""
+
+    gait: Gait = Gait()
+    scenario: Scenario = make_scenario("nominal")
+    robot: Thormang = Thormang()
+    joints: dict[str, ElasticJoint] = Field(default_factory=lambda: Thormang().joints)
+    """The leg joints as they are known; the scenario says in what the true ones differ."""
+    form: Literal["tendon", "rigid"] = "tendon"
+    """Elastic, or rigid for what an inelastic robot would do."""
+    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
+    timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
+    reward: WalkRewardWeights = WalkRewardWeights()
+
+    @property
+    def true_joints(self) -> dict[str, ElasticJoint]:
+        """The joints as the plant has them, a spread of their stiffness aside."""
+        scenario = self.scenario
+        return {
+            name: joint.replace(
+                stiffness=joint.stiffness * scenario.stiffness_scale,
+                coulomb_friction=joint.coulomb_friction * scenario.friction_scale,
+                viscous_friction=joint.viscous_friction * scenario.friction_scale,
+                backlash=joint.backlash + scenario.backlash_rad,
+            )
+            for name, joint in self.joints.items()
+        }
+
+    def true_model(self) -> mujoco.MjModel:
+        """The plant, a spread of stiffness and the direction of a slope aside."""
+        spec = elastic_spec(self.robot, self.true_joints, self.form, self.timestep_s)
+        load = self.scenario.torso_load_kg
+        if load > 0.0:
+            torso = spec.body("upper_body")
+            torso.add_body(
+                name="load", pos=torso.ipos, mass=load, inertia=[load * _LOAD_GYRATION_M**2] * 3, explicitinertial=True
+            )
+        return spec.compile()
+
+
+_LOAD_GYRATION_M = 0.1
+
+
+class RobotDraw(Model):
+    """What of a robot is drawn: a scenario with a random robot has a bank of these, an episode takes one of them."""
+
+    stiffness_factor: tuple[float, ...] = (1.0,) * len(LEG_JOINTS)
+    encoder_bias_rad: tuple[float, ...] = (0.0,) * len(LEG_JOINTS)
+    slope_direction_rad: float = 0.0
+
+
+BANK_SIZE = 64
+"""Robots in the bank of a scenario that draws them."""
+
+
+def robot_bank(scenario: Scenario) -> list[RobotDraw]:
+    """The robots of a scenario: one, or a bank, the same in every process."""
+    if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
+        return [RobotDraw()]
+    generator, n = np.random.default_rng(_BANK_SEED), len(LEG_JOINTS)
+    return [
+        RobotDraw(
+            stiffness_factor=tuple((1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()),
+            encoder_bias_rad=tuple((scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()),
+            slope_direction_rad=float(generator.uniform(0.0, 2.0 * np.pi)),
+        )
+        for _ in range(BANK_SIZE)
+    ]
+
+
+_BANK_SEED = 20150

@@ -1,0 +1,572 @@
+"""The walking task: a humanoid on elastic legs walks in place, its pelvis level, its ZMP where the plan has it.
+
+Observation of one world (float64); joints are l_hip_yaw, l_hip_roll, l_hip_pitch, l_knee, l_ankle_pitch, l_ankle_roll,
+then the same of the right leg (r_...); a name before a dot has one column per joint or component after it:
+
+| columns | names | unit | meaning |
+|---|---|---|---|
+| 0 to 11 | `encoder_angle.<joint>` | rad | motor encoder, θ in whole counts |
+| 12 to 23 | `encoder_rate.<joint>` | rad/s | its change over the last control period |
+| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis |
+| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis |
+| 29 to 34 | `wrench.l_fx`, `_fy`, `_fz`, `_mx`, `_my`, `_mz` | N, N·m | left ankle sensor: force and moment of the foot on \
+the leg, in the frame of the foot, about the ankle |
+| 35 to 40 | `wrench.r_fx` ... | N, N·m | right ankle sensor |
+| 41 to 52 | `reference_angle.<joint>` | rad | q_ref at the end of the coming control period |
+| 53 to 64 | `reference_rate.<joint>` | rad/s | its rate |
+| 65 to 76 | `reference_acceleration.<joint>` | rad/s² | its acceleration |
+| 77 | `clock.time` | s | end of the coming control period, from the start of the walk plan |
+| 78 | `clock.swing` | 1 | progress of the swing, 0 before lift-off, 1 after touch-down |
+| 79 | `clock.support` | 1 | support foot of the step, 0 left, 1 right |
+| 80 | `load_share` | 1 | share μ of the weight on the right foot |
+| 81, 82 | `zmp_reference.x`, `.y` | m | in the plan's world frame |
+| 83 to 94 | `last_command.<joint>` | rad | θ_cmd of the last control period |
+
+Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in the order of the joints, within ±0.3.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from elastic_env.elasticity import joint_torque
+from elastic_env.errors import ConfigurationError
+from elastic_env.metrics import Metric
+from elastic_env.robots.joint_names import JointAddresses, spring_name
+from elastic_env.robots.robot_model import RobotModel, WalkerModel
+from elastic_env.robots.standing import Equilibrium, settle
+from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
+from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
+from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
+from elastic_env.simulation import Simulation
+from elastic_env.tasks.walk_config import FALL_HEIGHT_SHARE, FALL_TILT_RAD, WalkConfig, robot_bank
+from elastic_env.walking.contact_force import shares
+from elastic_env.walking.gait import LEFT, RIGHT
+from elastic_env.walking.ground_contact import ground_wrench, zero_moment_point
+from elastic_env.walking.walk_plan import plan_walk, require_feasible
+
+ACTION_BOUND_RAD = 0.3
+"""Largest command offset [rad]."""
+
+UNLOADED_SHARE = 0.05
+"""Share of the weight below which a foot, or both together, count as unloaded."""
+
+FELL = "fell"
+
+
+def _per_joint(name: str, unit: str, meaning: str) -> tuple[Signal, ...]:
+    return tuple(Signal(f"{name}.{joint}", unit, f"{meaning}, {joint}") for joint in LEG_JOINTS)
+
+
+def _wrench(side: str) -> tuple[Signal, ...]:
+    return tuple(
+        Signal(f"wrench.{side}_{kind}{axis}", unit, f"{what} of the {side} foot on its leg along {axis}, at the ankle")
+        for kind, unit, what in (("f", "N", "force"), ("m", "N·m", "moment"))
+        for axis in "xyz"
+    )
+
+
+ACTION = SignalTable(
+    tuple(
+        Signal(f"command_offset.{joint}", "rad", f"θ_cmd − q_ref of {joint}", -ACTION_BOUND_RAD, ACTION_BOUND_RAD)
+        for joint in LEG_JOINTS
+    )
+)
+
+OBSERVATION = SignalTable(
+    (
+        *_per_joint("encoder_angle", "rad", "motor encoder, θ in whole counts"),
+        *_per_joint("encoder_rate", "rad/s", "change of the encoder over the last control period"),
+        *(Signal(f"imu_attitude.{axis}", "rad", f"{axis} of the pelvis by its IMU") for axis in ("roll", "pitch")),
+        *(Signal(f"imu_rate.{axis}", "rad/s", f"gyroscope of the pelvis about its {axis}") for axis in "xyz"),
+        *_wrench("l"),
+        *_wrench("r"),
+        *_per_joint("reference_angle", "rad", "q_ref at the end of the coming control period"),
+        *_per_joint("reference_rate", "rad/s", "its rate"),
+        *_per_joint("reference_acceleration", "rad/s²", "its acceleration"),
+        Signal("clock.time", "s", "end of the coming control period, from the start of the walk plan"),
+        Signal("clock.swing", "1", "progress of the swing, 0 before lift-off, 1 after touch-down"),
+        Signal("clock.support", "1", "support foot of the step, 0 left, 1 right"),
+        Signal("load_share", "1", "share of the weight on the right foot"),
+        Signal("zmp_reference.x", "m", "reference of the ZMP, forward"),
+        Signal("zmp_reference.y", "m", "reference of the ZMP, to the left"),
+        *_per_joint("last_command", "rad", "θ_cmd of the last control period"),
+    )
+)
+
+PHASES = ("double", "single", "transition")
+"""Masks by which the scores are split: double support, single support, ±0.2 s around lift-off and touch-down."""
+
+_PELVIS = ("pelvis_roll", "pelvis_pitch", "pelvis_error")
+_ZMP = (("zmp_deviation", "zmp_deviation"), ("zmp_deviation_x", "zmp_deviation_x"), ("zmp_deviation_y", "zmp_deviation_y"))
+
+METRICS = (
+    *(Metric(f"{signal}_{s}_rad", signal, s) for signal in _PELVIS for s in ("rms", "peak")),
+    *(Metric(f"{name}_{s}_m", signal, s, over="loaded") for name, signal in _ZMP for s in ("rms", "peak")),
+    *(Metric(f"{signal}_{phase}_rms_rad", signal, "rms", over=phase) for phase in PHASES for signal in _PELVIS),
+    *(
+        Metric(f"{name}_{phase}_rms_m", signal, "rms", over=f"{phase}_loaded")
+        for phase in PHASES
+        for name, signal in _ZMP
+    ),
+    Metric("unloaded_samples_count", "zmp_deviation", "count", over="unloaded"),
+    Metric("link_error_rms_rad", "link_error", "rms"),
+    Metric("link_error_min_rad", "link_error_lowest", "min"),
+    Metric("link_error_max_rad", "link_error_highest", "max"),
+    Metric("deflection_rms_rad", "deflection", "rms"),
+    Metric("early_touchdown_mean_s", "early_touchdown", "mean", over="touchdown"),
+    Metric("early_touchdown_max_s", "early_touchdown", "max", over="touchdown"),
+    Metric("servo_torque_rms_nm", "servo_torque", "rms"),
+    Metric("joint_torque_peak_nm", "joint_torque", "peak", over="all"),
+    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, over="all") for s in ("rms", "peak")),
+    Metric("clipped_share", "clipped", "mean", over="all"),
+    Metric("duration_s", "time_s", "max", over="all"),
+)
+
+
+@dataclass(frozen=True)
+class WalkTruth:
+    """Noise-free state of the walker and its true parameters, one row per world. For scoring and the oracle.
+
+    Attributes:
+        theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 12) [rad], [rad/s].
+        pelvis: Position of the pelvis, (num_worlds, 3) [m].
+        pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
+        ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
+        stiffness: True K, (num_worlds, 12) [N·m/rad].
+        model: The true joints, a spread of their stiffness aside.
+    """
+
+    theta: Array
+    theta_dot: Array
+    q: Array
+    q_dot: Array
+    pelvis: Array
+    pelvis_R: Array
+    ankles: Array
+    stiffness: Array
+    model: RobotModel
+
+
+def tilt_penalty(pelvis_error: Array) -> Array:
+    """−|tilt| [rad]: linear, so that a large error never stops to matter."""
+    return -np.abs(pelvis_error)
+
+
+def zmp_penalty(zmp_deviation: Array) -> Array:
+    """−|ZMP deviation| [m]; none where the feet are not loaded and there is no ZMP."""
+    return -np.nan_to_num(zmp_deviation)
+
+
+class WalkTask:
+    """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.tasks.task.Task`."""
+
+    action_table = ACTION
+    observation_table = OBSERVATION
+    metrics: Sequence[Metric] = METRICS
+
+    def __init__(self, config: WalkConfig, num_worlds: int) -> None:
+        self.config = config
+        self.num_worlds = num_worlds
+        self.num_substeps = _num_substeps(config)
+        robot = biped(config.robot)
+        self.plan = plan_walk(config.gait, robot, config.control_period_s)
+        self.assumed_model = WalkerModel(
+            config.joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
+        )
+        require_feasible(self.plan, robot, self.assumed_model.servos)
+        self._true_model = RobotModel(config.true_joints, robot.rigid, config.control_period_s, OBSERVATION)
+        self.model = config.true_model()
+        self._robot = robot
+        self._at = JointAddresses.of(self.model, LEG_JOINTS)
+        self._bank = robot_bank(config.scenario)
+        self._equilibria: dict[int, Equilibrium] = {}
+        self._springs = (
+            np.array([self.model.tendon(spring_name(joint)).id for joint in LEG_JOINTS])
+            if config.form == "tendon"
+            else None
+        )
+        feet = [self.model.body(f"{side}_foot").id for side in SIDES]
+        self._foot_mass, self._foot_com = self.model.body_mass[feet], self.model.body_ipos[feet]
+        self._sites = np.array([self.model.site(f"{side}_ft").id for side in SIDES])
+        self._torso = self.model.body("upper_body").id
+        self._gravity = self.model.opt.gravity.copy()
+        self._weight = float(self.model.body_mass.sum()) * robot.gravity
+        n, m = num_worlds, len(LEG_JOINTS)
+        self._step = np.zeros(n, dtype=np.int64)
+        self._draw = np.zeros(n, dtype=np.int64)
+        self._stiffness = np.tile(self._true_model.stiffness, (n, 1))
+        self._encoder_bias, self._imu_bias = np.zeros((n, m)), np.zeros((n, 2))
+        self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
+        self._noise = NoiseStream(n, width=_NOISE_WIDTH)
+        self._state = _State.zeros(n)
+        self._measured = self._shown = _Measurement.zeros(n)
+        self._offset, self._offset_before, self._command = np.zeros((3, n, m))
+        self._contact_since = np.full(n, -1, dtype=np.int64)
+        self._is_touchdown = np.zeros(self.plan.num_steps + 1, dtype=np.bool_)
+        single = self.plan.timing.single
+        self._is_touchdown[1:] = single[:-1] & ~single[1:]
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps of an episode."""
+        return self.plan.num_steps
+
+    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+        """Place robots in static equilibrium under zero offset."""
+        scenario = self.config.scenario
+        simulation.bind("xfrc_applied")[worlds] = 0.0
+        for world in np.flatnonzero(worlds).tolist():
+            generator = generators[world]
+            self._draw[world] = generator.integers(len(self._bank))
+            self._imu_bias[world] = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+            self._draw_push(world, generator)
+            self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
+            self._place(simulation, world)
+        self._step[worlds] = 0
+        self._offset[worlds] = self._offset_before[worlds] = 0.0
+        self._command[worlds] = self.plan.q[0]
+        self._contact_since[worlds] = -1
+        simulation.refresh(worlds)
+        self._read(simulation, worlds)
+        fresh = self._measure(worlds)
+        at_rest = _Measurement(fresh.encoder, fresh.encoder, fresh.attitude, fresh.rate, fresh.wrench)
+        self._measured = self._measured.with_worlds(worlds, at_rest)
+        self._shown = self._shown.with_worlds(worlds, at_rest)
+
+    def command(self, offset: Array) -> Array:
+        """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
+        self._offset_before, self._offset = self._offset, offset.copy()
+        self._command = self.plan.q[self._row(1)] + self._offset
+        return self._command - self._encoder_bias
+
+    def disturb(self, simulation: Simulation) -> None:
+        """Push the torso where and when the scenario says."""
+        if self.config.scenario.push_n > 0.0:
+            steps = round(self.config.scenario.push_s / self.config.control_period_s)
+            since = self._step - self._push_begin
+            active = (since >= 0) & (since < steps)
+            simulation.bind("xfrc_applied")[:, self._torso, :3] = np.where(active[:, None], self._push_force, 0.0)
+
+    def sense(self, simulation: Simulation) -> None:
+        """Read the new state, then what the sensors show of it."""
+        self._step += 1
+        healthy = ~simulation.diverged()
+        self._read(simulation, healthy)
+        before, self._measured = self._measured, self._measure(healthy)
+        self._shown = before if self.config.scenario.delay_steps else self._measured
+        self._watch_swing_foot()
+
+    def observe(self) -> Array:
+        """See the table of the module."""
+        row, shown, plan, timing = self._row(1), self._shown, self.plan, self.plan.timing
+        observation = np.empty((self.num_worlds, len(OBSERVATION)))
+        observation[:, 0:12] = shown.encoder
+        observation[:, 12:24] = (shown.encoder - shown.encoder_before) / self.config.control_period_s
+        observation[:, 24:26] = shown.attitude
+        observation[:, 26:29] = shown.rate
+        observation[:, 29:41] = shown.wrench
+        observation[:, 41:53] = plan.q[row]
+        observation[:, 53:65] = plan.q_dot[row]
+        observation[:, 65:77] = plan.q_ddot[row]
+        observation[:, 77] = timing.time[row]
+        observation[:, 78] = timing.swing[row]
+        observation[:, 79] = timing.support[row]
+        observation[:, 80] = plan.share[row]
+        observation[:, 81:83] = plan.zmp[row]
+        observation[:, 83:95] = self._command
+        return observation
+
+    def signals(self) -> Signals:
+        """Truth and scores of this step, (num_worlds,) each."""
+        row, state, plan = self._row(), self._state, self.plan
+        q_ref = plan.q[row]
+        error = q_ref - state.q
+        deflection = state.theta - state.q
+        torque = joint_torque(deflection, state.theta_dot - state.q_dot, self._stiffness, self._true_model.damping)
+        zmp_ref = plan.zmp[row]
+        deviation = state.zmp - zmp_ref
+        roll, pitch, tilt = state.attitude
+        rate = (self._offset - self._offset_before) / self.config.control_period_s
+        return {
+            "time_s": self._step * self.config.control_period_s,
+            "pelvis_roll": roll.copy(),
+            "pelvis_pitch": pitch.copy(),
+            "pelvis_error": tilt.copy(),
+            "pelvis_height": state.pelvis[:, 2].copy(),
+            "zmp_x": state.zmp[:, 0].copy(),
+            "zmp_y": state.zmp[:, 1].copy(),
+            "zmp_reference_x": zmp_ref[:, 0],
+            "zmp_reference_y": zmp_ref[:, 1],
+            "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
+            "zmp_deviation_x": deviation[:, 0],
+            "zmp_deviation_y": deviation[:, 1],
+            "link_error": _rms(error),
+            "link_error_lowest": error.min(axis=1),
+            "link_error_highest": error.max(axis=1),
+            "deflection": _rms(deflection),
+            "joint_torque": np.abs(torque).max(axis=1),
+            "servo_torque": _rms(state.servo_torque),
+            "command_rate": _rms(rate),
+            "force_left": state.force[:, LEFT].copy(),
+            "force_right": state.force[:, RIGHT].copy(),
+            "load_share": plan.share[row],
+            "swing": plan.timing.swing[row],
+            "single_support": plan.timing.single[row],
+            "support": plan.timing.support[row],
+            "early_touchdown": self._earliness(),
+        }
+
+    def reward_terms(self, signals: Signals, diverged: BoolArray) -> dict[str, Array]:
+        """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
+        weights = self.config.reward
+        fallen = diverged | self._fallen()
+        return {
+            "tilt": weights.tilt * tilt_penalty(signals["pelvis_error"]),
+            "zmp": weights.zmp * zmp_penalty(signals["zmp_deviation"]),
+            "effort": -weights.effort * signals["servo_torque"],
+            "smoothness": -weights.smoothness * signals["command_rate"],
+            "fall": -weights.fall * fallen.astype(np.float64),
+        }
+
+    def scored(self) -> BoolArray:
+        """The walk: standing before and after it does not count."""
+        return self.plan.timing.walking[self._row()]
+
+    def masks(self) -> dict[str, BoolArray]:
+        """Phases, and where there is a ZMP."""
+        row, timing = self._row(), self.plan.timing
+        loaded = ~np.isnan(self._state.zmp[:, 0])
+        phases = {"double": ~timing.single[row], "single": timing.single[row], "transition": timing.transition[row]}
+        return {
+            **phases,
+            **{f"{name}_loaded": mask & loaded for name, mask in phases.items()},
+            "loaded": loaded,
+            "unloaded": ~loaded,
+            "touchdown": self._is_touchdown[row],
+        }
+
+    def finished(self) -> BoolArray:
+        """The plan has come to its end."""
+        return self._step >= self.num_steps
+
+    def failures(self) -> dict[str, BoolArray]:
+        """A fall: the pelvis is too low or too much tilted."""
+        return {FELL: self._fallen()}
+
+    def truth(self) -> WalkTruth:
+        """State without noise, and the true parameters."""
+        s = self._state
+        copies = (x.copy() for x in (s.theta, s.theta_dot, s.q, s.q_dot, s.pelvis, s.pelvis_R, s.ankles))
+        return WalkTruth(*copies, stiffness=self._stiffness.copy(), model=self._true_model)
+
+    def _row(self, ahead: int = 0) -> IntArray:
+        return np.minimum(self._step + ahead, self.num_steps)
+
+    def _fallen(self) -> BoolArray:
+        low = self._state.pelvis[:, 2] < FALL_HEIGHT_SHARE * self.config.gait.hip_height_m
+        return low | (self._state.attitude[2] > FALL_TILT_RAD)
+
+    def _draw_push(self, world: int, generator: np.random.Generator) -> None:
+        """Time and direction of the push, in the walk."""
+        walking = np.flatnonzero(self.plan.timing.walking)
+        begin = generator.integers(walking[0], walking[-1] + 1)
+        direction = generator.uniform(0.0, 2.0 * np.pi)
+        self._push_begin[world] = begin
+        self._push_force[world] = self.config.scenario.push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
+
+    def _place(self, simulation: Simulation, world: int) -> None:
+        """Give a world its robot, at rest."""
+        scenario, number = self.config.scenario, int(self._draw[world])
+        draw = self._bank[number]
+        self._encoder_bias[world] = draw.encoder_bias_rad
+        self._stiffness[world] = self._true_model.stiffness * np.array(draw.stiffness_factor)
+        if scenario.stiffness_spread > 0.0 and self._springs is not None:
+            simulation.vary("tendon_stiffness")[world, self._springs] = self._stiffness[world]
+        if scenario.slope_rad > 0.0:
+            floor = simulation.model.body("floor").id
+            simulation.vary("body_quat")[world, floor] = _tilt(scenario.slope_rad, draw.slope_direction_rad)
+        rest = self._equilibrium(number)
+        simulation.qpos[world] = rest.qpos
+        simulation.qvel[world] = 0.0
+        simulation.act[world] = rest.act
+        simulation.ctrl[world] = self.plan.q[0] - self._encoder_bias[world]
+        simulation.bind("qacc_warmstart")[world] = rest.warmstart
+
+    def _equilibrium(self, number: int) -> Equilibrium:
+        """The rest state of a robot of the bank, found once."""
+        if number not in self._equilibria:
+            draw, scenario, model = self._bank[number], self.config.scenario, copy.copy(self.model)
+            if self._springs is not None:
+                model.tendon_stiffness[self._springs] *= np.array(draw.stiffness_factor)
+            if scenario.slope_rad > 0.0:
+                model.body("floor").quat[:] = _tilt(scenario.slope_rad, draw.slope_direction_rad)
+            q = self.plan.q[0] - np.array(draw.encoder_bias_rad)
+            self._equilibria[number] = settle(model, LEG_JOINTS, self.plan.pelvis[0], q, q)
+        return self._equilibria[number]
+
+    def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
+        """The true state of some worlds; the others keep their last one."""
+        at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
+        sensors = -simulation.bind("sensordata").reshape(-1, 2, 2, 3)  # MuJoCo's act on the foot, ours on the leg
+        foot_R = simulation.bind("site_xmat")[:, self._sites].reshape(-1, 2, 3, 3)
+        ankles = simulation.bind("site_xpos")[:, self._sites]
+        force, moment = ground_wrench(
+            sensors[:, :, 0], sensors[:, :, 1], foot_R, self._foot_mass, self._foot_com, self._gravity
+        )
+        pelvis_R = _matrix(qpos[:, 3:7])
+        fresh = _State(
+            theta=qpos[:, at.theta],
+            theta_dot=qvel[:, at.theta_dot],
+            q=qpos[:, at.q],
+            q_dot=qvel[:, at.q_dot],
+            pelvis=qpos[:, :3].copy(),
+            pelvis_R=pelvis_R,
+            attitude=_attitude(pelvis_R),
+            rate=qvel[:, 3:6].copy(),
+            ankles=ankles,
+            wrench=sensors.reshape(-1, 12),
+            force=force[..., 2],
+            zmp=zero_moment_point(force, moment, ankles, UNLOADED_SHARE * self._weight),
+            servo_torque=simulation.bind("actuator_force").copy(),
+        )
+        self._state = fresh if worlds.all() else self._state.with_worlds(worlds, fresh)
+
+    def _measure(self, worlds: BoolArray) -> "_Measurement":
+        """What the sensors say now; the other worlds keep their last values."""
+        scenario, state, last = self.config.scenario, self._state, self._measured
+        counts = self._true_model.encoder_counts_per_turn if scenario.encoder_counts else None
+        noise = self._noise.next(worlds)
+        due = worlds & is_due(self._step, scenario.pelvis_imu.rate_hz, self.config.control_period_s)
+        roll_pitch = np.stack(state.attitude[:2], axis=-1)
+        tilt = attitude(scenario.pelvis_imu, roll_pitch, self._imu_bias, noise[:, 0:2])
+        spread = np.array([*[scenario.force_noise_n] * 3, *[scenario.moment_noise_nm] * 3] * 2)
+        fresh = _Measurement(
+            encoder=quantise(state.theta + self._encoder_bias, counts),
+            encoder_before=last.encoder,
+            attitude=np.where(due[:, None], tilt, last.attitude),
+            rate=np.where(due[:, None], state.rate + scenario.gyro_noise_rad_s * noise[:, 2:5], last.rate),
+            wrench=state.wrench + spread * noise[:, 5:17],
+        )
+        return fresh if worlds.all() else last.with_worlds(worlds, fresh)
+
+    def _watch_swing_foot(self) -> None:
+        """Since when the swing foot has been on the ground in the second half of its swing."""
+        row, timing = self._row(), self.plan.timing
+        swing_foot = RIGHT - timing.support[row]
+        loaded = self._state.force[np.arange(self.num_worlds), swing_foot] > UNLOADED_SHARE * self._weight
+        descending = timing.single[row] & (timing.swing[row] > 0.5)
+        first = descending & loaded & (self._contact_since < 0)
+        self._contact_since = np.where(first, self._step, self._contact_since)
+        rising = timing.single[row] & (timing.swing[row] <= 0.5)
+        self._contact_since = np.where(rising, -1, self._contact_since)
+
+    def _earliness(self) -> Array:
+        """By how much the swing foot of the last swing touched down before its time [s]."""
+        early = (self._step - self._contact_since) * self.config.control_period_s
+        return np.where(self._is_touchdown[self._row()] & (self._contact_since >= 0), early, 0.0)
+
+
+_NOISE_WIDTH = 2 + 3 + 12
+
+
+@dataclass(frozen=True)
+class _State:
+    """The true state, one row per world."""
+
+    theta: Array
+    theta_dot: Array
+    q: Array
+    q_dot: Array
+    pelvis: Array
+    pelvis_R: Array
+    attitude: tuple[Array, Array, Array]
+    rate: Array
+    ankles: Array
+    wrench: Array
+    force: Array
+    zmp: Array
+    servo_torque: Array
+
+    @classmethod
+    def zeros(cls, n: int) -> "_State":
+        """A state to be overwritten."""
+        m = len(LEG_JOINTS)
+        return cls(
+            *np.zeros((4, n, m)), np.zeros((n, 3)), np.zeros((n, 3, 3)), tuple(np.zeros((3, n))), np.zeros((n, 3)),
+            np.zeros((n, 2, 3)), np.zeros((n, 12)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, m)),
+        )  # fmt: skip
+
+    def with_worlds(self, worlds: BoolArray, other: "_State") -> "_State":
+        """This state with that of another in some worlds."""
+        return _State(**_chosen(worlds, vars(other), vars(self)))
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """Sensor values, one row per world; the encoders also a control period earlier."""
+
+    encoder: Array
+    encoder_before: Array
+    attitude: Array
+    rate: Array
+    wrench: Array
+
+    @classmethod
+    def zeros(cls, n: int) -> "_Measurement":
+        """A measurement to be overwritten."""
+        m = len(LEG_JOINTS)
+        return cls(*np.zeros((2, n, m)), np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 12)))
+
+    def with_worlds(self, worlds: BoolArray, other: "_Measurement") -> "_Measurement":
+        """These values with those of another measurement in some worlds."""
+        return _Measurement(**_chosen(worlds, vars(other), vars(self)))
+
+
+def _chosen(worlds: BoolArray, these: dict, others: dict) -> dict:
+    def choose(a, b):
+        if isinstance(a, tuple):
+            return tuple(choose(x, y) for x, y in zip(a, b, strict=True))
+        return np.where(worlds.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return {name: choose(these[name], others[name]) for name in these}
+
+
+def _rms(values: Array) -> Array:
+    """Root of the mean square over the joints."""
+    return np.sqrt(np.mean(values * values, axis=1))
+
+
+def _matrix(quaternion: Array) -> Array:
+    """Rotation of unit quaternions w, x, y, z, (n, 4) to (n, 3, 3)."""
+    w, x, y, z = quaternion.T
+    R = np.empty((len(quaternion), 3, 3))
+    R[:, 0, 0], R[:, 0, 1], R[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    R[:, 1, 0], R[:, 1, 1], R[:, 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    R[:, 2, 0], R[:, 2, 1], R[:, 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return R
+
+
+def _attitude(R: Array) -> tuple[Array, Array, Array]:
+    """Roll and pitch (of yaw, pitch, roll), and the angle between the z axis and the vertical, (n,) each [rad]."""
+    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
+    pitch = -np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0))
+    return roll, pitch, np.arctan2(np.hypot(R[:, 0, 2], R[:, 1, 2]), R[:, 2, 2])
+
+
+def _tilt(angle: float, direction: float) -> Array:
+    """Quaternion that raises the floor in a direction."""
+    half = angle / 2.0
+    return np.array([np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0])
+
+
+def _num_substeps(config: WalkConfig) -> int:
+    ratio = config.control_period_s / config.timestep_s
+    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+        raise ConfigurationError(
+            "control_period_s must be a multiple of timestep_s, "
+            f"got {config.control_period_s} s and {config.timestep_s} s"
+        )
+    return round(ratio)

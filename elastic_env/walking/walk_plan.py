@@ -1,0 +1,206 @@
+"""The walk as a table: gait, ZMP, center of mass, pelvis, feet and joint angles at every control step.
+
+The pelvis stays level at one height and moves so that the center of mass of the whole robot, not the pelvis, follows
+the preview control.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from elastic_env.elasticity import Servo
+from elastic_env.errors import ConfigurationError, ElasticError
+from elastic_env.rigid_body import FloatingBody
+from elastic_env.signals import Array
+from elastic_env.walking.biped import Biped
+from elastic_env.walking.contact_force import contact_points, load_share, shares
+from elastic_env.walking.gait import RIGHT, Gait, Timing, step_timing, zmp_reference
+from elastic_env.walking.leg_chains import cross
+from elastic_env.walking.preview_control import PreviewConfig, follow_zmp
+
+_COM_TOLERANCE_M = 1e-10
+_MAX_ITERATIONS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class WalkPlan:
+    """A walk in place, one row per control step, row k at the end of control period k, row 0 the start.
+
+    Positions are in the world frame: x forward, y left, z up, the origin on the ground halfway between the feet.
+
+    Attributes:
+        gait: What was planned.
+        timing: Phases.
+        q, q_dot, q_ddot: Joint angles and their derivatives, (T, 12) [rad], [rad/s], [rad/s²].
+        zmp: Reference of the ZMP, (T, 2) [m].
+        com, com_dot: Center of mass in the plane, (T, 2) [m], [m/s].
+        com_height: Height of the center of mass over the ground while the robot stands [m].
+        pelvis: Position of the level pelvis, (T, 3) [m].
+        ankles: Left and right ankle, (T, 2, 3) [m].
+        share: Share μ of the weight on the right foot, (T,).
+        torque: Joint torques of the motion by inverse dynamics, the contact force shared by μ, (T, 12) [N·m].
+    """
+
+    gait: Gait
+    timing: Timing
+    q: Array
+    q_dot: Array
+    q_ddot: Array
+    zmp: Array
+    com: Array
+    com_dot: Array
+    com_height: float
+    pelvis: Array
+    ankles: Array
+    share: Array
+    torque: Array
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps of an episode."""
+        return len(self.q) - 1
+
+    @property
+    def omega(self) -> float:
+        """Natural frequency of the inverted pendulum, √(g/z_c) [1/s]."""
+        return float(np.sqrt(9.81 / self.com_height))
+
+
+@lru_cache(maxsize=32)
+def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
+    """Plan a walk; every plan is computed once.
+
+    Args:
+        gait: What to walk.
+        biped: The robot as it is assumed.
+        control_period_s: Time between rows [s].
+
+    Raises:
+        ConfigurationError: Durations that do not fit the control period.
+        ElasticError: A foot out of reach.
+    """
+    timing = step_timing(gait, control_period_s)
+    ankles = _ankle_paths(gait, timing, biped)
+    zmp = zmp_reference(gait, timing, biped.footholds)
+    pelvis, com_height = _standing(gait, biped, zmp[0], ankles[0])
+    motion = follow_zmp(PreviewConfig(com_height_m=com_height, period_s=control_period_s), zmp, zmp[0])
+    pelvis = _pelvis_under(motion.com, pelvis, biped, ankles, timing)
+    q = _angles(biped, pelvis, ankles, timing)
+    q_dot, q_ddot = derivatives(q, control_period_s)
+    share = load_share(zmp, biped.footholds)
+    torque = _dynamic_torque(biped, pelvis, q, zmp, share, control_period_s)
+    return WalkPlan(
+        gait, timing, q, q_dot, q_ddot, zmp, motion.com, motion.com_dot, com_height, pelvis, ankles, share, torque
+    )
+
+
+def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) -> None:
+    """A plan that the robot cannot follow is an error now, not a fall later.
+
+    Raises:
+        ConfigurationError: A joint leaves its range or needs more speed or torque than its servo has.
+    """
+    joints = [biped.rigid.joint(name) for name in biped.joint_names]
+    low, high = np.array([joint.range for joint in joints]).T
+    _require(plan, biped, -plan.q, -low, "an angle of at least", "rad", sign=-1.0)
+    _require(plan, biped, plan.q, high, "an angle of at most", "rad")
+    _require(plan, biped, np.abs(plan.q_dot), np.array([s.speed_limit for s in servos]), "a speed of at most", "rad/s")
+    _require(plan, biped, np.abs(plan.torque), np.array([s.torque_limit for s in servos]), "at most", "N·m")
+
+
+def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
+    """First and second derivative of samples, time first, by central differences; zero at the ends, where all stands."""
+    first, second = np.zeros_like(samples), np.zeros_like(samples)
+    first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
+    second[1:-1] = (samples[2:] - 2.0 * samples[1:-1] + samples[:-2]) / period_s**2
+    return first, second
+
+
+def swing_height(progress: Array) -> Array:
+    """Height of the swing foot over its lift, 64 s³ (1 − s)³: no speed and no acceleration at both ends."""
+    return 64.0 * (progress * (1.0 - progress)) ** 3
+
+
+def _ankle_paths(gait: Gait, timing: Timing, biped: Biped) -> Array:
+    ankles = np.empty((len(timing.time), 2, 3))
+    ankles[..., :2] = biped.footholds
+    ankles[..., 2] = biped.ankle_height
+    rows = np.arange(len(timing.time))
+    ankles[rows, RIGHT - timing.support, 2] += gait.lift_m * swing_height(timing.swing)
+    return ankles
+
+
+def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Array, float]:
+    """Pelvis over the ZMP at rest, and the height of the center of mass."""
+    pelvis = np.array([*zmp, gait.hip_height_m])
+    for _ in range(_MAX_ITERATIONS):
+        com = pelvis + biped.chains.frames(biped.joint_angles(pelvis, ankles).reshape(2, -1)).com
+        pelvis[:2] -= com[:2] - zmp
+    return pelvis, float(com[2])
+
+
+def _pelvis_under(com: Array, standing: Array, biped: Biped, ankles: Array, timing: Timing) -> Array:
+    """Pelvis whose height stays and that puts the center of mass where it belongs: the legs lag behind a little."""
+    pelvis = np.repeat(standing[None], len(com), axis=0)
+    for _ in range(_MAX_ITERATIONS):
+        q = _angles(biped, pelvis, ankles, timing)
+        error = pelvis[:, :2] + biped.chains.frames(q.reshape(len(q), 2, -1)).com[:, :2] - com
+        pelvis[:, :2] -= error
+        if np.abs(error).max() < _COM_TOLERANCE_M:
+            return pelvis
+    raise ElasticError(
+        f"no pelvis position brings the center of mass within {_COM_TOLERANCE_M} m of its reference; "
+        f"{np.abs(error).max():.3g} m are left after {_MAX_ITERATIONS} iterations"
+    )
+
+
+def _angles(biped: Biped, pelvis: Array, ankles: Array, timing: Timing) -> Array:
+    try:
+        return biped.joint_angles(pelvis, ankles)
+    except ElasticError:
+        distance = np.linalg.norm(ankles - pelvis[:, None] - biped.hips, axis=-1)
+        row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
+        raise ConfigurationError(
+            f"the {('left', 'right')[leg]} foot is out of reach at {timing.time[row]:.3f} s: {distance[row, leg]:.4f} m "
+            f"from the hip to the ankle, at most {biped.leg.reach:g} m; lower hip_height_m, or shift the ZMP less"
+        ) from None
+
+
+def _dynamic_torque(biped: Biped, pelvis: Array, q: Array, zmp: Array, share: Array, period_s: float) -> Array:
+    """Inverse dynamics of the whole body; the force that the ground must give is shared between the feet."""
+    body = FloatingBody(biped.rigid, biped.joint_names)
+    pelvis_dot, pelvis_ddot = derivatives(pelvis, period_s)
+    q_dot, q_ddot = derivatives(q, period_s)
+    wrench, torque = body.inverse_dynamics(q, pelvis_dot, q_dot, pelvis_ddot, q_ddot)
+    force, moment = wrench[:, :3], wrench[:, 3:]
+    # where the ground's force acts: its moment about the pelvis has no horizontal part about that point
+    height = -pelvis[:, 2]
+    x = (-moment[:, 1] + height * force[:, 0]) / force[:, 2]
+    y = (moment[:, 0] + height * force[:, 1]) / force[:, 2]
+    zmp_of_motion = np.stack([x, y], axis=-1)
+    about_zmp = moment[:, 2] - (x * force[:, 1] - y * force[:, 0])
+    feet = biped.footholds - pelvis[:, None, :2]
+    weights = shares(share)
+    points = np.concatenate(
+        [contact_points(zmp_of_motion, share, feet), np.broadcast_to(height[:, None, None], (len(q), 2, 1))], axis=-1
+    )
+    forces = weights[..., None] * force[:, None]
+    moments = np.zeros_like(forces)
+    moments[..., 2] = weights * about_zmp[:, None]
+    frames = biped.chains.frames(q.reshape(len(q), 2, -1))
+    load = cross(points[..., None, :] - frames.anchors, forces[..., None, :]) + moments[..., None, :]
+    return torque - (frames.axes * load).sum(axis=-1).reshape(len(q), -1)
+
+
+def _require(
+    plan: WalkPlan, biped: Biped, values: Array, bound: Array, what: str, unit: str, sign: float = 1.0
+) -> None:
+    excess = values - bound
+    row, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+    if excess[row, joint] > 0.0:
+        raise ConfigurationError(
+            f"the walk asks too much of joint {biped.joint_names[joint]!r} at {plan.timing.time[row]:.3f} s: it allows "
+            f"{what} {sign * bound[joint]:.3f} {unit}, the plan needs {sign * values[row, joint]:.3f} {unit}; "
+            "use longer durations, a lower lift or another hip height"
+        )
