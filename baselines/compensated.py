@@ -6,8 +6,9 @@ import numpy as np
 
 from baselines.compensators import Compensator, Motion
 from baselines.policy import Action, ObservationView, Policy, resume
-from elastic_env.plan import STAND_S, quintic
-from elastic_env.signals import Array, SignalTable
+from baselines.startup import Ramp
+from elastic_env.plan import STAND_S
+from elastic_env.signals import Array
 
 
 class Compensated:
@@ -20,8 +21,6 @@ class Compensated:
     Args:
         policy: Anything with `predict`; its state may be anything.
         compensator: Where the motor has to lead, and where the link is.
-        table: Observation table of the environment; None for that of the compensator's model.
-        control_period_s: Time between observations; None for that of the compensator's model.
         ramp_s: Duration of the ramp.
     """
 
@@ -29,15 +28,12 @@ class Compensated:
         self,
         policy: Policy,
         compensator: Compensator,
-        table: SignalTable | None = None,
-        control_period_s: float | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
         self.policy, self.compensator = policy, compensator
         model = compensator.model
-        self._view = ObservationView(model.observation_table if table is None else table)
-        control_period_s = model.control_period_s if control_period_s is None else control_period_s
-        self._ramp_steps = max(round(ramp_s / control_period_s), 1)
+        self._view = ObservationView(model.observation_table)
+        self._ramp = Ramp(model, ramp_s)
 
     def predict(
         self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -56,8 +52,7 @@ class Compensated:
         wanted = Motion(desired.q + action, desired.q_dot, desired.q_ddot)
         offset, kept = compensator.offset(wanted, memory[:, 1:])
         steps = memory[:, :1] + 1.0
-        share, _, _ = quintic(steps / self._ramp_steps)
-        total = (action + share * offset).astype(np.float32)
+        total = (action + self._ramp.share(steps) * offset).astype(np.float32)
         return total.reshape((*observation.shape[:-1], total.shape[-1])), (np.hstack([steps, kept]), inner_state)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
@@ -79,8 +74,9 @@ class Compensated:
     ) -> tuple[Array, Any]:
         """The wrapped policy's action on an observation whose encoder columns are those of the links."""
         theta, theta_dot = self._view.theta(rows), self._view.theta_dot(rows)
-        seen = self._view.with_links(
-            rows, compensator.link_angle(theta, memory[:, 1:]), compensator.link_rate(theta, theta_dot)
-        )
+        q = compensator.link_angle(theta, memory[:, 1:])
+        if state is not None and getattr(compensator, "_output", "") in ("taylor", "newton") and hasattr(self.policy, "windup"):
+            q = q - self.policy.windup(state)
+        seen = self._view.with_links(rows, q, compensator.link_rate(theta, theta_dot))
         action, state = self.policy.predict(seen if ndim > 1 else seen[0], state, episode_start, deterministic)
         return np.atleast_2d(np.asarray(action, dtype=np.float64)), state

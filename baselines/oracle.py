@@ -6,8 +6,9 @@ import numpy as np
 
 from baselines.compensators import DynamicCompensator
 from baselines.policy import Action, ObservationView, resume
+from baselines.startup import Ramp
 from elastic_env.errors import ElasticError
-from elastic_env.plan import STAND_S, quintic
+from elastic_env.plan import STAND_S
 from elastic_env.signals import Array
 
 
@@ -33,7 +34,7 @@ class Oracle:
         self._view = ObservationView(self._env.task.observation_table)
         self._compensator = DynamicCompensator(model, friction=True)
         self._dt = model.control_period_s
-        self._ramp_steps = max(round(ramp_s / self._dt), 1)
+        self._ramp = Ramp(model, ramp_s)
 
     def predict(
         self,
@@ -57,13 +58,12 @@ class Oracle:
         )  # fmt: skip
         steps, correction, target, kept = np.split(memory, [1, 1 + n, 1 + 2 * n], axis=1)
         steps = steps + 1.0
-        error = np.where(steps > self._ramp_steps, target - self._env.truth().q, 0.0)
+        error = np.where(self._ramp.is_over(steps - 1.0), target - self._env.truth().q, 0.0)
         correction = np.clip(
             correction + self.integral_gain * self._dt * error, -self.integral_limit, self.integral_limit
         )
         offset, kept = self._compensator.offset(motion, kept)
-        share, _, _ = quintic(steps / self._ramp_steps)
-        action = (share * offset + correction).astype(np.float32)
+        action = (self._ramp.share(steps) * offset + correction).astype(np.float32)
         new_state = np.hstack([steps, correction, motion.q, kept]), None
         return action.reshape((*observation.shape[:-1], n)), new_state
 

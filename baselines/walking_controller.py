@@ -36,6 +36,7 @@ class WalkingGains(Model):
     zmp_limit_m: float = quantity("m", 0.06, gt=0, description="largest ZMP shift")
     velocity_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the COM velocity")
     zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
+    friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0, description="joint rate at which friction acts in full")
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,7 @@ class WalkingController:
         self._ramp_steps = max(round(ramp_s / self._dt), 1)
         stiffness = model.stiffness.reshape(2, 6)
         self._ankle_stiffness = stiffness[:, 4:]
+        self._friction_deflection = model.coulomb_friction / model.stiffness
 
     def predict(
         self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True  # noqa: ARG002
@@ -100,17 +102,23 @@ class WalkingController:
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
+        steps, z, last, velocity, shift, _ = np.split(memory, [1, 2, 6, 8, 10], axis=1)
         steps = steps + 1.0
         share, _, _ = quintic(steps / self._ramp_steps)
         z = self._leg_difference(rows, z)
         coms = (frame.com[:, None] - frame.soles)[..., :2]
         if self._com_feedback:
             velocity, shift = self._zmp_shift(rows, coms, last.reshape(coms.shape), velocity, shift)
-        action = share * (self._leg_offsets(rows, z) + self._ankle_offsets(rows, shift))
-        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift])
+        windup = share * self._ankle_offsets(rows, shift)
+        action = share * self._leg_offsets(rows, z) + windup
+        action = action + self._friction_offsets(rows)
+        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, windup])
         action = action.astype(np.float32)
         return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
+
+    def windup(self, state: Any) -> Array:
+        """Part of the last action that winds springs instead of moving links, (num_worlds, 12) [rad]."""
+        return state[0][:, 10:]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
         """The encoder angles, (..., 12) [rad]: without an output compensator it takes motors for links."""
@@ -120,7 +128,7 @@ class WalkingController:
     def _begin(self, frame: LocalFrame) -> Array:
         coms = (frame.com[:, None] - frame.soles)[..., :2].reshape(len(frame.com), 4)
         zero = np.zeros((len(coms), 1))
-        return np.hstack([zero, zero, coms, zero, zero, zero, zero])
+        return np.hstack([zero, zero, coms, zero, zero, zero, zero, np.zeros((len(coms), 12))])
 
     def _leg_difference(self, rows: Array, z: Array) -> Array:
         """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
@@ -162,6 +170,10 @@ class WalkingController:
         offsets[..., 2] = at_hip
         offsets[..., 4] = -bend - at_hip
         return offsets.reshape(len(rows), 12)
+
+    def _friction_offsets(self, rows: Array) -> Array:
+        """Offsets that wind the springs against the dry friction of joints that the plan moves, (num_worlds, 12) [rad]."""
+        return self._friction_deflection * np.tanh(self._view.motion(rows).q_dot / self._gains.friction_rate_rad_s)
 
     def _ankle_offsets(self, rows: Array, shift: Array) -> Array:
         """Offsets that wind the ankle springs by the torque of a ZMP shift, (num_worlds, 12) [rad]."""

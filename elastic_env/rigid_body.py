@@ -113,6 +113,14 @@ class FloatingBody:
             wrench[i], torque[i] = effort[base_v : base_v + 6], effort[self._v]
         return wrench, torque
 
+    def mass_matrix(self, q: Array) -> Array:
+        """Joint-space inertia: base force and moment, then hinges, (n,) [rad] to (6 + n, 6 + n) [kg], [kg·m], [kg·m²]."""
+        position = np.zeros(self._model.nq)
+        position[self._base_q + 6], position[self._q] = 1.0, q
+        rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])
+        full = pinocchio.crba(self._model, self._data, position)
+        return np.triu(full)[np.ix_(rows, rows)] + np.triu(full, 1).T[np.ix_(rows, rows)]
+
     def center_of_mass(self, q: Array) -> Array:
         """Center of mass of the whole robot in the frame of the base, (N, n) [rad] to (N, 3) [m]."""
         position = np.zeros(self._model.nq)

@@ -43,17 +43,26 @@ class WalkConfig(Model):
     reward: WalkRewardWeights = WalkRewardWeights()
 
     @property
+    def assumed_joints(self) -> dict[str, ElasticJoint]:
+        """The joints as a policy may know them: the ground's friction is known, from an identification."""
+        return {
+            name: joint.replace(
+                coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
+                viscous_friction=joint.viscous_friction * self.scenario.friction_scale,
+            )
+            for name, joint in self.joints.items()
+        }
+
+    @property
     def true_joints(self) -> dict[str, ElasticJoint]:
         """The joints as the plant has them, a spread of their stiffness aside."""
         scenario = self.scenario
         return {
             name: joint.replace(
                 stiffness=joint.stiffness * scenario.stiffness_scale,
-                coulomb_friction=joint.coulomb_friction * scenario.friction_scale,
-                viscous_friction=joint.viscous_friction * scenario.friction_scale,
                 backlash=joint.backlash + scenario.backlash_rad,
             )
-            for name, joint in self.joints.items()
+            for name, joint in self.assumed_joints.items()
         }
 
     def true_model(self) -> mujoco.MjModel:

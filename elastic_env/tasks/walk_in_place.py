@@ -174,7 +174,7 @@ class WalkTask:
         robot = biped(config.robot)
         self.plan = plan_walk(config.gait, robot, config.control_period_s)
         self.assumed_model = WalkerModel(
-            config.joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
+            config.assumed_joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
         )
         require_feasible(self.plan, robot, self.assumed_model.servos)
         self._true_model = RobotModel(config.true_joints, robot.rigid, config.control_period_s, OBSERVATION)

@@ -34,6 +34,7 @@ class WalkPlan:
         timing: Phases.
         q, q_dot, q_ddot: Joint angles and their derivatives, (T, 12) [rad], [rad/s], [rad/s²].
         zmp: Reference of the ZMP, (T, 2) [m].
+        zmp_of_motion: ZMP of the planned motion by inverse dynamics, (T, 2) [m].
         com, com_dot: Center of mass in the plane, (T, 2) [m], [m/s].
         com_height: Height of the center of mass over the ground while the robot stands [m].
         pelvis: Position of the level pelvis, (T, 3) [m].
@@ -48,6 +49,7 @@ class WalkPlan:
     q_dot: Array
     q_ddot: Array
     zmp: Array
+    zmp_of_motion: Array
     com: Array
     com_dot: Array
     com_height: float
@@ -83,16 +85,19 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     timing = step_timing(gait, control_period_s)
     ankles = _ankle_paths(gait, timing, biped)
     zmp = zmp_reference(gait, timing, biped.footholds)
-    pelvis, com_height = _standing(gait, biped, zmp[0], ankles[0])
-    motion = follow_zmp(PreviewConfig(com_height_m=com_height, period_s=control_period_s), zmp, zmp[0])
-    pelvis = _pelvis_under(motion.com, pelvis, biped, ankles, timing)
+    standing, com_height = _standing(gait, biped, zmp[0], ankles[0])
+    preview = PreviewConfig(com_height_m=com_height, period_s=control_period_s)
+    motion = follow_zmp(preview, zmp, zmp[0])
+    pelvis = _pelvis_under(motion.com, standing, biped, ankles, timing)
     q = _angles(biped, pelvis, ankles, timing)
+    dynamics = _dynamics(biped, pelvis, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
     share = load_share(zmp, biped.footholds)
-    torque = _dynamic_torque(biped, pelvis, q, zmp, share, control_period_s)
+    torque = _joint_torque(biped, pelvis, q, dynamics, share)
     return WalkPlan(
-        gait, timing, q, q_dot, q_ddot, zmp, motion.com, motion.com_dot, com_height, pelvis, ankles, share, torque
-    )
+        gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height, pelvis, ankles, share,
+        torque,
+    )  # fmt: skip
 
 
 def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) -> None:
@@ -167,30 +172,43 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, timing: Timing) -> Array
         ) from None
 
 
-def _dynamic_torque(biped: Biped, pelvis: Array, q: Array, zmp: Array, share: Array, period_s: float) -> Array:
-    """Inverse dynamics of the whole body; the force that the ground must give is shared between the feet."""
+@dataclass(frozen=True)
+class _Dynamics:
+    """What a motion needs of the ground, (T, ...): force, its ZMP, its moment about the vertical; and of the joints."""
+
+    force: Array
+    zmp: Array
+    moment: Array
+    torque: Array
+
+
+def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynamics:
+    """Inverse dynamics of the whole body."""
     body = FloatingBody(biped.rigid, biped.joint_names)
     pelvis_dot, pelvis_ddot = derivatives(pelvis, period_s)
     q_dot, q_ddot = derivatives(q, period_s)
     wrench, torque = body.inverse_dynamics(q, pelvis_dot, q_dot, pelvis_ddot, q_ddot)
     force, moment = wrench[:, :3], wrench[:, 3:]
-    # where the ground's force acts: its moment about the pelvis has no horizontal part about that point
+    # the moment of the ground's force about the pelvis has no horizontal part about the ZMP
     height = -pelvis[:, 2]
     x = (-moment[:, 1] + height * force[:, 0]) / force[:, 2]
     y = (moment[:, 0] + height * force[:, 1]) / force[:, 2]
-    zmp_of_motion = np.stack([x, y], axis=-1)
     about_zmp = moment[:, 2] - (x * force[:, 1] - y * force[:, 0])
-    feet = biped.footholds - pelvis[:, None, :2]
+    return _Dynamics(force, np.stack([x, y], axis=-1) + pelvis[:, :2], about_zmp, torque)
+
+
+def _joint_torque(biped: Biped, pelvis: Array, q: Array, dynamics: _Dynamics, share: Array) -> Array:
+    """Joint torques, the ground's force shared between the feet, (T, 12) [N·m]."""
     weights = shares(share)
-    points = np.concatenate(
-        [contact_points(zmp_of_motion, share, feet), np.broadcast_to(height[:, None, None], (len(q), 2, 1))], axis=-1
-    )
-    forces = weights[..., None] * force[:, None]
+    points = np.zeros((len(q), 2, 3))
+    points[..., :2] = contact_points(dynamics.zmp, share, biped.footholds)
+    forces = weights[..., None] * dynamics.force[:, None]
     moments = np.zeros_like(forces)
-    moments[..., 2] = weights * about_zmp[:, None]
+    moments[..., 2] = weights * dynamics.moment[:, None]
     frames = biped.chains.frames(q.reshape(len(q), 2, -1))
-    load = cross(points[..., None, :] - frames.anchors, forces[..., None, :]) + moments[..., None, :]
-    return torque - (frames.axes * load).sum(axis=-1).reshape(len(q), -1)
+    arms = (points - pelvis[:, None])[..., None, :] - frames.anchors
+    load = cross(arms, forces[..., None, :]) + moments[..., None, :]
+    return dynamics.torque - (frames.axes * load).sum(axis=-1).reshape(len(q), -1)
 
 
 def _require(
