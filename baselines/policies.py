@@ -25,6 +25,7 @@ class PolicyOptions(Model):
     stiffness: Any = None
     """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of an identification;
     None for the environment's assumed model."""
+    stiffness_scale: float = quantity("1", 1.0, gt=0, description="further factor on the K that is assumed")
     output: OutputMethod | None = None
     """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and "none"; None for
     what the policy's name says."""
@@ -47,10 +48,11 @@ def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noq
 
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    if options.stiffness is not None:
-        raise ConfigurationError(
-            f"the oracle knows the true stiffness, got stiffness={options.stiffness!r}; leave it out"
-        )
+    for name in ("stiffness", "stiffness_scale"):
+        if getattr(options, name) != PolicyOptions.model_fields[name].default:
+            raise ConfigurationError(
+                f"the oracle knows the true stiffness, got {name}={getattr(options, name)!r}; leave it out"
+            )
     return Oracle(env, options.ramp_s)
 
 
@@ -141,4 +143,6 @@ def make(name: str, env: Any, **options: Any) -> Policy:
 
 def _assumed(env: Any, options: PolicyOptions) -> RobotModel:
     model: RobotModel = env.unwrapped.assumed_model
-    return model if options.stiffness is None else model.with_stiffness(read_stiffness(options.stiffness))
+    if options.stiffness is not None:
+        model = model.with_stiffness(read_stiffness(options.stiffness))
+    return model if options.stiffness_scale == 1.0 else model.with_stiffness(options.stiffness_scale * model.stiffness)
