@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensators import Compensator, Motion
+from baselines.compensators import Compensator
 from baselines.policy import Action, ObservationView, Policy, resume
 from baselines.startup import Ramp
 from elastic_env.plan import STAND_S
@@ -49,8 +49,7 @@ class Compensated:
             state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1, 0)))
         )
         action, inner_state = self._inner(compensator, rows, inner_state, episode_start, deterministic, observation.ndim, memory)
-        wanted = Motion(desired.q + action, desired.q_dot, desired.q_ddot)
-        offset, kept = compensator.offset(wanted, memory[:, 1:])
+        offset, kept = compensator.offset(desired.shifted(action), memory[:, 1:])
         steps = memory[:, :1] + 1.0
         total = (action + self._ramp.share(steps) * offset).astype(np.float32)
         return total.reshape((*observation.shape[:-1], total.shape[-1])), (np.hstack([steps, kept]), inner_state)

@@ -27,6 +27,10 @@ class Motion:
     q_dot: Array
     q_ddot: Array
 
+    def shifted(self, offset: Array) -> "Motion":
+        """The motion with its angles moved by an offset [rad]."""
+        return Motion(self.q + offset, self.q_dot, self.q_ddot)
+
 
 def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel) -> Array:
     r"""Eq. 9: θ_cmd − θ_d = K⁻¹ τ_g(θ_d), the offset that brings the link to θ_d.
@@ -198,6 +202,12 @@ class DynamicCompensator:
         bound = copy.copy(self)
         bound._static, bound._body = self._static.at(rows), self._source.at(rows)
         return bound
+
+    def with_stiffness(self, stiffness: Array) -> "DynamicCompensator":
+        """The compensator with another K, also one for every world, (..., n) [N·m/rad]."""
+        stiffer = copy.copy(self)
+        stiffer._K = stiffness
+        return stiffer
 
     def begin(self, motion: Motion) -> Array:
         """See `Compensator`."""

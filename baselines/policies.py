@@ -47,15 +47,6 @@ def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noq
     return Zero(model.observation_table)
 
 
-def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    for name in ("stiffness", "stiffness_scale"):
-        if getattr(options, name) != PolicyOptions.model_fields[name].default:
-            raise ConfigurationError(
-                f"the oracle knows the true stiffness, got {name}={getattr(options, name)!r}; leave it out"
-            )
-    return Oracle(env, options.ramp_s)
-
-
 def _around_zero(compensator: Compensating) -> Builder:
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
         made = compensator(model, options.output or "taylor", options.gravity)
@@ -80,6 +71,18 @@ def _open(build: Builder) -> Builder:
     return lambda env, model, options: build(env, model, options.replace(com_feedback=False))
 
 
+def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    for name in ("stiffness", "stiffness_scale"):
+        if getattr(options, name) != PolicyOptions.model_fields[name].default:
+            raise ConfigurationError(
+                f"the oracle knows the true stiffness, got {name}={getattr(options, name)!r}; leave it out"
+            )
+    if isinstance(model, WalkerModel):
+        controller = _controller(env, env.unwrapped.truth().model, options)
+        return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)
+    return Oracle(env, _zero(env, model, options), options.ramp_s)
+
+
 _ON_THE_TESTBED: dict[str, Builder] = {
     "zero": _zero,
     "uncompensated": _zero,
@@ -98,6 +101,7 @@ _ON_THE_WALKER: dict[str, Builder] = {
     "input_output": _around_controller(GravityCompensator, "taylor"),
     "input_wrench": _around_controller(GravityCompensator, "wrench"),
     "dynamic": _around_controller(DynamicCompensator, "wrench"),
+    "oracle": _oracle,
 }
 
 

@@ -40,6 +40,7 @@ SOLE_HALF_SIZE_M = (0.13, 0.08)
 """Half length and half width of the sole, whose middle lies under the ankle [m]."""
 
 _SOLE_HALF_THICKNESS = 0.01
+_LOAD_GYRATION_M = 0.1
 _TWIN_KNEE = {"stiffness": 2.0, "rotor_inertia": 2.0, "damping": 2.0, "coulomb_friction": 2.0}
 
 
@@ -50,6 +51,7 @@ class Thormang(Model):
     twin_knee: bool = False
     """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction and torque."""
     friction: float = quantity("1", 0.8, gt=0, description="friction of the soles")
+    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="mass carried in the middle of the upper body")
 
     @property
     def joints(self) -> dict[str, ElasticJoint]:
@@ -113,6 +115,10 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
         elif link.limits is not None:
             body.add_joint(name=link.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=link.axis, range=link.limits,
                            limited=mujoco.mjtLimited.mjLIMITED_TRUE)  # fmt: skip
+    if robot.torso_load_kg > 0.0:
+        torso, load = bodies["upper_body"], robot.torso_load_kg
+        inertia = [load * _LOAD_GYRATION_M**2] * 3
+        torso.add_body(name="load", pos=torso.ipos, mass=load, inertia=inertia, explicitinertial=True)
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")

@@ -65,19 +65,14 @@ class WalkConfig(Model):
             for name, joint in self.assumed_joints.items()
         }
 
+    @property
+    def true_robot(self) -> Thormang:
+        """The robot as the plant has it."""
+        return self.robot.replace(torso_load_kg=self.robot.torso_load_kg + self.scenario.torso_load_kg)
+
     def true_model(self) -> mujoco.MjModel:
         """The plant, a spread of stiffness and the direction of a slope aside."""
-        spec = elastic_spec(self.robot, self.true_joints, self.form, self.timestep_s)
-        load = self.scenario.torso_load_kg
-        if load > 0.0:
-            torso = spec.body("upper_body")
-            torso.add_body(
-                name="load", pos=torso.ipos, mass=load, inertia=[load * _LOAD_GYRATION_M**2] * 3, explicitinertial=True
-            )
-        return spec.compile()
-
-
-_LOAD_GYRATION_M = 0.1
+        return elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s).compile()
 
 
 class RobotDraw(Model):

@@ -35,7 +35,7 @@ from elastic_env.elasticity import joint_torque
 from elastic_env.errors import ConfigurationError
 from elastic_env.metrics import Metric
 from elastic_env.robots.joint_names import JointAddresses, spring_name
-from elastic_env.robots.robot_model import RobotModel, WalkerModel
+from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.robots.standing import Equilibrium, settle
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
@@ -45,7 +45,7 @@ from elastic_env.tasks.walk_config import FALL_HEIGHT_SHARE, FALL_TILT_RAD, Walk
 from elastic_env.walking.contact_force import shares
 from elastic_env.walking.gait import LEFT, RIGHT
 from elastic_env.walking.ground_contact import ground_wrench, zero_moment_point
-from elastic_env.walking.walk_plan import plan_walk, require_feasible
+from elastic_env.walking.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
@@ -136,7 +136,7 @@ class WalkTruth:
         pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
         stiffness: True K, (num_worlds, 12) [N·m/rad].
-        model: The true joints, a spread of their stiffness aside.
+        model: The true joints and masses, a spread of stiffness aside.
     """
 
     theta: Array
@@ -147,7 +147,7 @@ class WalkTruth:
     pelvis_R: Array
     ankles: Array
     stiffness: Array
-    model: RobotModel
+    model: WalkerModel
 
 
 def tilt_penalty(pelvis_error: Array) -> Array:
@@ -177,7 +177,7 @@ class WalkTask:
             config.assumed_joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
         )
         require_feasible(self.plan, robot, self.assumed_model.servos)
-        self._true_model = RobotModel(config.true_joints, robot.rigid, config.control_period_s, OBSERVATION)
+        self._true_model = _true_model(config, self.plan)
         self.model = config.true_model()
         self._robot = robot
         self._at = JointAddresses.of(self.model, LEG_JOINTS)
@@ -467,6 +467,13 @@ class WalkTask:
         """By how much the swing foot of the last swing touched down before its time [s]."""
         early = (self._step - self._contact_since) * self.config.control_period_s
         return np.where(self._is_touchdown[self._row()] & (self._contact_since >= 0), early, 0.0)
+
+
+def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
+    """The true joints and masses, and the torques that the planned motion needs of them."""
+    true = biped(config.true_robot)
+    plan = plan if config.true_robot == config.robot else with_torque(plan, true, config.control_period_s)
+    return WalkerModel(config.true_joints, true.rigid, config.control_period_s, OBSERVATION, biped=true, plan=plan)
 
 
 _NOISE_WIDTH = 2 + 3 + 12

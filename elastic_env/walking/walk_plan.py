@@ -4,7 +4,7 @@ The pelvis stays level at one height and moves so that the center of mass of the
 the preview control.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -98,6 +98,13 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
         gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height, pelvis, ankles, share,
         torque,
     )  # fmt: skip
+
+
+def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
+    """The same motion with the torques, and the ZMP, that it has on another robot of the same size."""
+    dynamics = _dynamics(biped, plan.pelvis, plan.q, control_period_s)
+    torque = _joint_torque(biped, plan.pelvis, plan.q, dynamics, plan.share)
+    return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
 
 
 def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) -> None:
