@@ -98,7 +98,7 @@ def configure_walk(
         raise ConfigurationError(f"gait must be a mapping of parameters of Gait, got {gait!r}; see also step_period")
     chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
     if isinstance(joint, ElasticJoint):
-        joints = {name: joint for name in chosen.joints}
+        joints = dict.fromkeys(chosen.joints, joint)
     else:
         joints = {name: own.replace(**(joint or {})) for name, own in chosen.joints.items()}
     if stiffness is not None:

@@ -95,8 +95,11 @@ class FloatingBody:
         """What a motion needs besides gravity compensation, and gravity, without any contact.
 
         Args:
-            q, q_dot, q_ddot: Hinges, (N, n) [rad], [rad/s], [rad/s²].
-            base_dot, base_ddot: Velocity and acceleration of the level base, (N, 3) [m/s], [m/s²].
+            q: Hinges, (N, n) [rad].
+            base_dot: Velocity of the level base, (N, 3) [m/s].
+            q_dot: Rates of the hinges [rad/s].
+            base_ddot: Acceleration of the base [m/s²].
+            q_ddot: Accelerations of the hinges [rad/s²].
 
         Returns:
             Force and moment about the origin of the base, (N, 6) [N], [N·m], and joint torques, (N, n) [N·m].
@@ -114,7 +117,7 @@ class FloatingBody:
         return wrench, torque
 
     def mass_matrix(self, q: Array) -> Array:
-        """Joint-space inertia: base force and moment, then hinges, (n,) [rad] to (6 + n, 6 + n) [kg], [kg·m], [kg·m²]."""
+        """Inertia of base translation, base rotation and hinges, (n,) [rad] to (6 + n, 6 + n) [kg], [kg·m], [kg·m²]."""
         position = np.zeros(self._model.nq)
         position[self._base_q + 6], position[self._q] = 1.0, q
         rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])

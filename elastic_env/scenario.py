@@ -25,11 +25,11 @@ class Scenario(Model):
     stiffness_spread: float = quantity(
         "1", 0.0, ge=0, lt=1, description="half-width of a further factor on every joint's stiffness, drawn per robot"
     )
-    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="testbed: true over assumed mass of the pendulum")
-    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="walker: mass on the torso, unknown to the compensator")
+    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="testbed: true over assumed mass of pendulum")
+    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="walker: mass on the torso, not in the model")
     push_n: float = quantity("N", 0.0, ge=0, description="walker: force of a push on the torso, anywhere in the walk")
     push_s: float = quantity("s", 0.1, gt=0, description="walker: duration of the push")
-    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5, description="walker: slope of the floor, in a drawn direction")
+    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5, description="walker: slope of the floor, direction drawn")
     encoder_counts: bool = True
     """Whether the encoders have whole counts."""
     encoder_bias_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the encoders' homing error")
@@ -56,8 +56,12 @@ _HOMING_ERROR_RAD = 2e-3
 GROUNDS: dict[str, Scenario] = {
     "ideal": Scenario(name="ideal", friction_scale=0.0, encoder_counts=False),
     "nominal": Scenario(
-        name="nominal", imu=_IMU, pelvis_imu=_PELVIS_IMU, gyro_noise_rad_s=_GYRO_NOISE_RAD_S,
-        force_noise_n=_FORCE_NOISE_N, moment_noise_nm=_MOMENT_NOISE_NM,
+        name="nominal",
+        imu=_IMU,
+        pelvis_imu=_PELVIS_IMU,
+        gyro_noise_rad_s=_GYRO_NOISE_RAD_S,
+        force_noise_n=_FORCE_NOISE_N,
+        moment_noise_nm=_MOMENT_NOISE_NM,
     ),
 }
 

@@ -80,7 +80,8 @@ class Worlds:
         truncated = self.task.finished() & ~terminated
         info: dict[str, Any] = {**signals, "reward_terms": terms, "termination": _reasons(failures, self.num_worlds)}
         if (terminated | truncated).any():
-            info["episode_metrics"] = {**self._metrics.values(), **{name: mask.copy() for name, mask in failures.items()}}
+            failed = {name: mask.copy() for name, mask in failures.items()}
+            info["episode_metrics"] = {**self._metrics.values(), **failed}
         reward = np.sum(list(terms.values()), axis=0)
         return Transition(self.task.observe(), reward, terminated, truncated, info)
 

@@ -65,12 +65,12 @@ def test_nobody_draws_from_global_randomness(file: Path) -> None:
 
 LAYERS = [
     ("errors", "config", "signals", "headless"),
-    ("elasticity", "sensors", "metrics"),
+    ("elasticity", "sensors", "metrics", "plan"),
     ("rigid_body",),
     ("walking",),
     ("robots",),
     ("scenario", "simulation"),
-    ("plan", "references"),
+    ("references",),
     ("tasks", "worlds", "rendering"),
     ("envs", "entry_points"),
     ("hardware",),

@@ -217,7 +217,8 @@ class TestbedTask:
         joint = self._joint
         deflection, deflection_rate = self._theta - self._q, self._theta_dot - self._q_dot
         torque = joint_torque(deflection, deflection_rate, joint.stiffness, joint.damping, joint.backlash)
-        columns = (self._theta, self._theta_dot, self._q, self._q_dot, deflection, torque, np.full_like(torque, joint.stiffness))
+        stiffness = np.full_like(torque, joint.stiffness)
+        columns = (self._theta, self._theta_dot, self._q, self._q_dot, deflection, torque, stiffness)
         return TestbedTruth(*(column[:, None].copy() for column in columns), model=self._true_model)
 
     def _place(self, simulation: Simulation, worlds: BoolArray) -> None:

@@ -9,9 +9,9 @@ then the same of the right leg (r_...); a name before a dot has one column per j
 | 12 to 23 | `encoder_rate.<joint>` | rad/s | its change over the last control period |
 | 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis |
 | 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis |
-| 29 to 34 | `wrench.l_fx`, `_fy`, `_fz`, `_mx`, `_my`, `_mz` | N, N·m | left ankle sensor: force and moment of the foot on \
-the leg, in the frame of the foot, about the ankle |
-| 35 to 40 | `wrench.r_fx` ... | N, N·m | right ankle sensor |
+| 29 to 31 | `wrench.l_fx`, `.l_fy`, `.l_fz` | N | left ankle sensor: force of foot on leg, in the foot's frame |
+| 32 to 34 | `wrench.l_mx`, `.l_my`, `.l_mz` | N·m | moment about the ankle, likewise |
+| 35 to 40 | `wrench.r_fx` to `.r_mz` | N, N·m | right ankle sensor |
 | 41 to 52 | `reference_angle.<joint>` | rad | q_ref at the end of the coming control period |
 | 53 to 64 | `reference_rate.<joint>` | rad/s | its rate |
 | 65 to 76 | `reference_acceleration.<joint>` | rad/s² | its acceleration |
@@ -27,7 +27,6 @@ Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,119 +34,21 @@ from elastic_env.elasticity import joint_torque
 from elastic_env.errors import ConfigurationError
 from elastic_env.metrics import Metric
 from elastic_env.robots.joint_names import JointAddresses, spring_name
-from elastic_env.robots.robot_model import WalkerModel
+from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.robots.standing import Equilibrium, settle
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
-from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
+from elastic_env.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.simulation import Simulation
 from elastic_env.tasks.walk_config import FALL_HEIGHT_SHARE, FALL_TILT_RAD, WalkConfig, robot_bank
-from elastic_env.walking.contact_force import shares
+from elastic_env.tasks.walk_state import WalkMeasurement, WalkState, WalkTruth, attitude_of, rms, rotation_of
+from elastic_env.tasks.walk_tables import ACTION, FELL, METRICS, OBSERVATION
 from elastic_env.walking.gait import LEFT, RIGHT
 from elastic_env.walking.ground_contact import ground_wrench, zero_moment_point
 from elastic_env.walking.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 
-ACTION_BOUND_RAD = 0.3
-"""Largest command offset [rad]."""
-
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or both together, count as unloaded."""
-
-FELL = "fell"
-
-
-def _per_joint(name: str, unit: str, meaning: str) -> tuple[Signal, ...]:
-    return tuple(Signal(f"{name}.{joint}", unit, f"{meaning}, {joint}") for joint in LEG_JOINTS)
-
-
-def _wrench(side: str) -> tuple[Signal, ...]:
-    return tuple(
-        Signal(f"wrench.{side}_{kind}{axis}", unit, f"{what} of the {side} foot on its leg along {axis}, at the ankle")
-        for kind, unit, what in (("f", "N", "force"), ("m", "N·m", "moment"))
-        for axis in "xyz"
-    )
-
-
-ACTION = SignalTable(
-    tuple(
-        Signal(f"command_offset.{joint}", "rad", f"θ_cmd − q_ref of {joint}", -ACTION_BOUND_RAD, ACTION_BOUND_RAD)
-        for joint in LEG_JOINTS
-    )
-)
-
-OBSERVATION = SignalTable(
-    (
-        *_per_joint("encoder_angle", "rad", "motor encoder, θ in whole counts"),
-        *_per_joint("encoder_rate", "rad/s", "change of the encoder over the last control period"),
-        *(Signal(f"imu_attitude.{axis}", "rad", f"{axis} of the pelvis by its IMU") for axis in ("roll", "pitch")),
-        *(Signal(f"imu_rate.{axis}", "rad/s", f"gyroscope of the pelvis about its {axis}") for axis in "xyz"),
-        *_wrench("l"),
-        *_wrench("r"),
-        *_per_joint("reference_angle", "rad", "q_ref at the end of the coming control period"),
-        *_per_joint("reference_rate", "rad/s", "its rate"),
-        *_per_joint("reference_acceleration", "rad/s²", "its acceleration"),
-        Signal("clock.time", "s", "end of the coming control period, from the start of the walk plan"),
-        Signal("clock.swing", "1", "progress of the swing, 0 before lift-off, 1 after touch-down"),
-        Signal("clock.support", "1", "support foot of the step, 0 left, 1 right"),
-        Signal("load_share", "1", "share of the weight on the right foot"),
-        Signal("zmp_reference.x", "m", "reference of the ZMP, forward"),
-        Signal("zmp_reference.y", "m", "reference of the ZMP, to the left"),
-        *_per_joint("last_command", "rad", "θ_cmd of the last control period"),
-    )
-)
-
-PHASES = ("double", "single", "transition")
-"""Masks by which the scores are split: double support, single support, ±0.2 s around lift-off and touch-down."""
-
-_PELVIS = ("pelvis_roll", "pelvis_pitch", "pelvis_error")
-_ZMP = (("zmp_deviation", "zmp_deviation"), ("zmp_deviation_x", "zmp_deviation_x"), ("zmp_deviation_y", "zmp_deviation_y"))
-
-METRICS = (
-    *(Metric(f"{signal}_{s}_rad", signal, s) for signal in _PELVIS for s in ("rms", "peak")),
-    *(Metric(f"{name}_{s}_m", signal, s, over="loaded") for name, signal in _ZMP for s in ("rms", "peak")),
-    *(Metric(f"{signal}_{phase}_rms_rad", signal, "rms", over=phase) for phase in PHASES for signal in _PELVIS),
-    *(
-        Metric(f"{name}_{phase}_rms_m", signal, "rms", over=f"{phase}_loaded")
-        for phase in PHASES
-        for name, signal in _ZMP
-    ),
-    Metric("unloaded_samples_count", "zmp_deviation", "count", over="unloaded"),
-    Metric("link_error_rms_rad", "link_error", "rms"),
-    Metric("link_error_min_rad", "link_error_lowest", "min"),
-    Metric("link_error_max_rad", "link_error_highest", "max"),
-    Metric("deflection_rms_rad", "deflection", "rms"),
-    Metric("early_touchdown_mean_s", "early_touchdown", "mean", over="touchdown"),
-    Metric("early_touchdown_max_s", "early_touchdown", "max", over="touchdown"),
-    Metric("servo_torque_rms_nm", "servo_torque", "rms"),
-    Metric("joint_torque_peak_nm", "joint_torque", "peak", over="all"),
-    *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, over="all") for s in ("rms", "peak")),
-    Metric("clipped_share", "clipped", "mean", over="all"),
-    Metric("duration_s", "time_s", "max", over="all"),
-)
-
-
-@dataclass(frozen=True)
-class WalkTruth:
-    """Noise-free state of the walker and its true parameters, one row per world. For scoring and the oracle.
-
-    Attributes:
-        theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 12) [rad], [rad/s].
-        pelvis: Position of the pelvis, (num_worlds, 3) [m].
-        pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
-        ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
-        stiffness: True K, (num_worlds, 12) [N·m/rad].
-        model: The true joints and masses, a spread of stiffness aside.
-    """
-
-    theta: Array
-    theta_dot: Array
-    q: Array
-    q_dot: Array
-    pelvis: Array
-    pelvis_R: Array
-    ankles: Array
-    stiffness: Array
-    model: WalkerModel
 
 
 def tilt_penalty(pelvis_error: Array) -> Array:
@@ -165,6 +66,7 @@ class WalkTask:
 
     action_table = ACTION
     observation_table = OBSERVATION
+    assumed_model: RobotModel
     metrics: Sequence[Metric] = METRICS
 
     def __init__(self, config: WalkConfig, num_worlds: int) -> None:
@@ -173,10 +75,10 @@ class WalkTask:
         self.num_substeps = _num_substeps(config)
         robot = biped(config.robot)
         self.plan = plan_walk(config.gait, robot, config.control_period_s)
-        self.assumed_model = WalkerModel(
+        model = self.assumed_model = WalkerModel(
             config.assumed_joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
         )
-        require_feasible(self.plan, robot, self.assumed_model.servos)
+        require_feasible(self.plan, robot, model.servos)
         self._true_model = _true_model(config, self.plan)
         self.model = config.true_model()
         self._robot = robot
@@ -201,8 +103,8 @@ class WalkTask:
         self._encoder_bias, self._imu_bias = np.zeros((n, m)), np.zeros((n, 2))
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
         self._noise = NoiseStream(n, width=_NOISE_WIDTH)
-        self._state = _State.zeros(n)
-        self._measured = self._shown = _Measurement.zeros(n)
+        self._state = WalkState.zeros(n)
+        self._measured = self._shown = WalkMeasurement.zeros(n)
         self._offset, self._offset_before, self._command = np.zeros((3, n, m))
         self._contact_since = np.full(n, -1, dtype=np.int64)
         self._is_touchdown = np.zeros(self.plan.num_steps + 1, dtype=np.bool_)
@@ -232,7 +134,7 @@ class WalkTask:
         simulation.refresh(worlds)
         self._read(simulation, worlds)
         fresh = self._measure(worlds)
-        at_rest = _Measurement(fresh.encoder, fresh.encoder, fresh.attitude, fresh.rate, fresh.wrench)
+        at_rest = WalkMeasurement(fresh.encoder, fresh.encoder, fresh.attitude, fresh.rate, fresh.wrench)
         self._measured = self._measured.with_worlds(worlds, at_rest)
         self._shown = self._shown.with_worlds(worlds, at_rest)
 
@@ -288,7 +190,7 @@ class WalkTask:
         torque = joint_torque(deflection, state.theta_dot - state.q_dot, self._stiffness, self._true_model.damping)
         zmp_ref = plan.zmp[row]
         deviation = state.zmp - zmp_ref
-        roll, pitch, tilt = state.attitude
+        roll, pitch, tilt = state.attitude.T
         rate = (self._offset - self._offset_before) / self.config.control_period_s
         return {
             "time_s": self._step * self.config.control_period_s,
@@ -303,13 +205,13 @@ class WalkTask:
             "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
             "zmp_deviation_x": deviation[:, 0],
             "zmp_deviation_y": deviation[:, 1],
-            "link_error": _rms(error),
+            "link_error": rms(error),
             "link_error_lowest": error.min(axis=1),
             "link_error_highest": error.max(axis=1),
-            "deflection": _rms(deflection),
+            "deflection": rms(deflection),
             "joint_torque": np.abs(torque).max(axis=1),
-            "servo_torque": _rms(state.servo_torque),
-            "command_rate": _rms(rate),
+            "servo_torque": rms(state.servo_torque),
+            "command_rate": rms(rate),
             "force_left": state.force[:, LEFT].copy(),
             "force_right": state.force[:, RIGHT].copy(),
             "load_share": plan.share[row],
@@ -367,7 +269,7 @@ class WalkTask:
 
     def _fallen(self) -> BoolArray:
         low = self._state.pelvis[:, 2] < FALL_HEIGHT_SHARE * self.config.gait.hip_height_m
-        return low | (self._state.attitude[2] > FALL_TILT_RAD)
+        return low | (self._state.attitude[:, 2] > FALL_TILT_RAD)
 
     def _draw_push(self, world: int, generator: np.random.Generator) -> None:
         """Time and direction of the push, in the walk."""
@@ -416,15 +318,15 @@ class WalkTask:
         force, moment = ground_wrench(
             sensors[:, :, 0], sensors[:, :, 1], foot_R, self._foot_mass, self._foot_com, self._gravity
         )
-        pelvis_R = _matrix(qpos[:, 3:7])
-        fresh = _State(
+        pelvis_R = rotation_of(qpos[:, 3:7])
+        fresh = WalkState(
             theta=qpos[:, at.theta],
             theta_dot=qvel[:, at.theta_dot],
             q=qpos[:, at.q],
             q_dot=qvel[:, at.q_dot],
             pelvis=qpos[:, :3].copy(),
             pelvis_R=pelvis_R,
-            attitude=_attitude(pelvis_R),
+            attitude=attitude_of(pelvis_R),
             rate=qvel[:, 3:6].copy(),
             ankles=ankles,
             wrench=sensors.reshape(-1, 12),
@@ -434,16 +336,15 @@ class WalkTask:
         )
         self._state = fresh if worlds.all() else self._state.with_worlds(worlds, fresh)
 
-    def _measure(self, worlds: BoolArray) -> "_Measurement":
+    def _measure(self, worlds: BoolArray) -> WalkMeasurement:
         """What the sensors say now; the other worlds keep their last values."""
         scenario, state, last = self.config.scenario, self._state, self._measured
         counts = self._true_model.encoder_counts_per_turn if scenario.encoder_counts else None
         noise = self._noise.next(worlds)
         due = worlds & is_due(self._step, scenario.pelvis_imu.rate_hz, self.config.control_period_s)
-        roll_pitch = np.stack(state.attitude[:2], axis=-1)
-        tilt = attitude(scenario.pelvis_imu, roll_pitch, self._imu_bias, noise[:, 0:2])
+        tilt = attitude(scenario.pelvis_imu, state.attitude[:, :2], self._imu_bias, noise[:, 0:2])
         spread = np.array([*[scenario.force_noise_n] * 3, *[scenario.moment_noise_nm] * 3] * 2)
-        fresh = _Measurement(
+        fresh = WalkMeasurement(
             encoder=quantise(state.theta + self._encoder_bias, counts),
             encoder_before=last.encoder,
             attitude=np.where(due[:, None], tilt, last.attitude),
@@ -477,90 +378,6 @@ def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
 
 
 _NOISE_WIDTH = 2 + 3 + 12
-
-
-@dataclass(frozen=True)
-class _State:
-    """The true state, one row per world."""
-
-    theta: Array
-    theta_dot: Array
-    q: Array
-    q_dot: Array
-    pelvis: Array
-    pelvis_R: Array
-    attitude: tuple[Array, Array, Array]
-    rate: Array
-    ankles: Array
-    wrench: Array
-    force: Array
-    zmp: Array
-    servo_torque: Array
-
-    @classmethod
-    def zeros(cls, n: int) -> "_State":
-        """A state to be overwritten."""
-        m = len(LEG_JOINTS)
-        return cls(
-            *np.zeros((4, n, m)), np.zeros((n, 3)), np.zeros((n, 3, 3)), tuple(np.zeros((3, n))), np.zeros((n, 3)),
-            np.zeros((n, 2, 3)), np.zeros((n, 12)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, m)),
-        )  # fmt: skip
-
-    def with_worlds(self, worlds: BoolArray, other: "_State") -> "_State":
-        """This state with that of another in some worlds."""
-        return _State(**_chosen(worlds, vars(other), vars(self)))
-
-
-@dataclass(frozen=True)
-class _Measurement:
-    """Sensor values, one row per world; the encoders also a control period earlier."""
-
-    encoder: Array
-    encoder_before: Array
-    attitude: Array
-    rate: Array
-    wrench: Array
-
-    @classmethod
-    def zeros(cls, n: int) -> "_Measurement":
-        """A measurement to be overwritten."""
-        m = len(LEG_JOINTS)
-        return cls(*np.zeros((2, n, m)), np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 12)))
-
-    def with_worlds(self, worlds: BoolArray, other: "_Measurement") -> "_Measurement":
-        """These values with those of another measurement in some worlds."""
-        return _Measurement(**_chosen(worlds, vars(other), vars(self)))
-
-
-def _chosen(worlds: BoolArray, these: dict, others: dict) -> dict:
-    def choose(a, b):
-        if isinstance(a, tuple):
-            return tuple(choose(x, y) for x, y in zip(a, b, strict=True))
-        return np.where(worlds.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-    return {name: choose(these[name], others[name]) for name in these}
-
-
-def _rms(values: Array) -> Array:
-    """Root of the mean square over the joints."""
-    return np.sqrt(np.mean(values * values, axis=1))
-
-
-def _matrix(quaternion: Array) -> Array:
-    """Rotation of unit quaternions w, x, y, z, (n, 4) to (n, 3, 3)."""
-    w, x, y, z = quaternion.T
-    R = np.empty((len(quaternion), 3, 3))
-    R[:, 0, 0], R[:, 0, 1], R[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    R[:, 1, 0], R[:, 1, 1], R[:, 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    R[:, 2, 0], R[:, 2, 1], R[:, 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return R
-
-
-def _attitude(R: Array) -> tuple[Array, Array, Array]:
-    """Roll and pitch (of yaw, pitch, roll), and the angle between the z axis and the vertical, (n,) each [rad]."""
-    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
-    pitch = -np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0))
-    return roll, pitch, np.arctan2(np.hypot(R[:, 0, 2], R[:, 1, 2]), R[:, 2, 2])
 
 
 def _tilt(angle: float, direction: float) -> Array:

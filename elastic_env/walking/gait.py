@@ -5,7 +5,7 @@ right foot, as Fig. 1 of the paper. Before and after the walk the robot stands.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -35,7 +35,7 @@ class Gait(Model):
     single_support_s: float = quantity("s", 0.8, gt=0, description="single support of a step")
     last_double_support_s: float = quantity("s", 1.1, gt=0, description="last double support of a step")
     num_steps: int = quantity("1", 4, ge=1, description="number of steps")
-    lift_m: float = quantity("m", 0.05, gt=0, description="height to which the swing foot is lifted")
+    lift_m: float = quantity("m", 0.025, gt=0, description="height to which the swing foot is lifted")
     hip_height_m: float = quantity("m", 0.66, gt=0, description="height of the hip axes over the ground")
     transfer: Literal["smooth", "ramp"] = "smooth"
     """How the ZMP goes from foot to foot: over the whole double support, or within 0.1 s before lift-off and after
@@ -61,7 +61,7 @@ class Gait(Model):
         return self
 
 
-def make_gait(step_period: "float | tuple[float, float, float] | list[float] | Gait", **parameters: object) -> Gait:
+def make_gait(step_period: "float | tuple[float, float, float] | list[float] | Gait", **parameters: Any) -> Gait:
     """A gait by its step period, or by the durations of double, single, double support [s].
 
     Args:

@@ -1,8 +1,8 @@
 r"""Zero moment point from the wrenches at the ankles.
 
-A force-torque sensor at the ankle measures what the foot passes on to the leg: the ground's force less the weight of the
-foot itself, (f, n) about the ankle, in the frame of the foot. With the sum of both feet's ground forces, taken about the
-origin on the ground, the ZMP is
+A force-torque sensor at the ankle measures what the foot passes on to the leg: the ground's force less the weight of
+the foot itself, (f, n) about the ankle, in the frame of the foot. With the ground's forces on both feet,
+taken about the origin on the ground, the ZMP is
 
 .. math:: x = -M_y / F_z, \quad y = M_x / F_z
 """
@@ -32,7 +32,7 @@ def ground_wrench(
     weight = foot_mass[:, None] * gravity[..., None, :]
     lever = (foot_R * foot_com[:, None, :]).sum(axis=-1)
     f = (foot_R * force[..., None, :]).sum(axis=-1) - weight
-    n = (foot_R * moment[..., None, :]).sum(axis=-1) - cross(lever, np.broadcast_to(weight, lever.shape))
+    n = (foot_R * moment[..., None, :]).sum(axis=-1) - cross(lever, weight)
     return f, n
 
 

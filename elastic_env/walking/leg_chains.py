@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.errors import ConfigurationError
-from elastic_env.signals import Array
+from elastic_env.signals import Array, IntArray
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class LegChains:
         com = (self._trunk_moment + carried[..., 0, :].sum(axis=-2)) / self.mass
         return LegFrames(axes, anchors, carried - self._carried[..., None] * anchors, R, com)
 
-    def _moment_of_the_rest(self, model: mujoco.MjModel, bodies: Array) -> Array:
+    def _moment_of_the_rest(self, model: mujoco.MjModel, bodies: IntArray) -> Array:
         """First moment of all bodies that are no leg, in the pelvis frame [kg·m]."""
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
@@ -103,9 +103,7 @@ class LegChains:
         return model.body_mass[others] @ relative
 
 
-def holding_torque(
-    frames: LegFrames, gravity: Array, force: Array, point: Array, moment: Array | None = None
-) -> Array:
+def holding_torque(frames: LegFrames, gravity: Array, force: Array, point: Array, moment: Array | None = None) -> Array:
     """Joint torques of legs at rest under contact forces, see the module.
 
     Args:
@@ -150,7 +148,7 @@ def _turned(R: Array, axis: int, sine: Array, cosine: Array) -> Array:
     return turned
 
 
-def _require_chains(model: mujoco.MjModel, joints: Array, bodies: Array, axis: Array) -> None:
+def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:
     level = np.allclose(model.body_quat[bodies], [1.0, 0.0, 0.0, 0.0], atol=1e-12)
     single = (model.body_jntnum[bodies] == 1).all() and np.allclose(model.jnt_pos[joints], 0.0, atol=1e-12)
     chained = (model.body_parentid[bodies[:, 1:]] == bodies[:, :-1]).all()

@@ -88,15 +88,15 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     standing, com_height = _standing(gait, biped, zmp[0], ankles[0])
     preview = PreviewConfig(com_height_m=com_height, period_s=control_period_s)
     motion = follow_zmp(preview, zmp, zmp[0])
-    pelvis = _pelvis_under(motion.com, standing, biped, ankles, timing)
-    q = _angles(biped, pelvis, ankles, timing)
+    pelvis = _pelvis_under(motion.com, np.tile(standing, (len(zmp), 1)), biped, ankles, timing.time)
+    q = _angles(biped, pelvis, ankles, timing.time)
     dynamics = _dynamics(biped, pelvis, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
     share = load_share(zmp, biped.footholds)
     torque = _joint_torque(biped, pelvis, q, dynamics, share)
     return WalkPlan(
-        gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height, pelvis, ankles, share,
-        torque,
+        gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height,
+        pelvis, ankles, share, torque,
     )  # fmt: skip
 
 
@@ -122,7 +122,7 @@ def require_feasible(plan: WalkPlan, biped: Biped, servos: tuple[Servo, ...]) ->
 
 
 def derivatives(samples: Array, period_s: float) -> tuple[Array, Array]:
-    """First and second derivative of samples, time first, by central differences; zero at the ends, where all stands."""
+    """First and second derivative of samples, time first, by central differences; zero at the ends, where it stands."""
     first, second = np.zeros_like(samples), np.zeros_like(samples)
     first[1:-1] = (samples[2:] - samples[:-2]) / (2.0 * period_s)
     second[1:-1] = (samples[2:] - 2.0 * samples[1:-1] + samples[:-2]) / period_s**2
@@ -145,18 +145,17 @@ def _ankle_paths(gait: Gait, timing: Timing, biped: Biped) -> Array:
 
 def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Array, float]:
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
-    pelvis = np.array([*zmp, gait.hip_height_m])
-    for _ in range(_MAX_ITERATIONS):
-        com = pelvis + biped.chains.frames(biped.joint_angles(pelvis, ankles).reshape(2, -1)).com
-        pelvis[:2] -= com[:2] - zmp
-    return pelvis, float(com[2])
+    start = np.array([[*zmp, gait.hip_height_m]])
+    pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], np.zeros(1))
+    com = pelvis + biped.chains.frames(_angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1)).com
+    return pelvis[0], float(com[0, 2])
 
 
-def _pelvis_under(com: Array, standing: Array, biped: Biped, ankles: Array, timing: Timing) -> Array:
+def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: Array) -> Array:
     """Pelvis whose height stays and that puts the center of mass where it belongs: the legs lag behind a little."""
-    pelvis = np.repeat(standing[None], len(com), axis=0)
+    pelvis, error = np.array(start), np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
-        q = _angles(biped, pelvis, ankles, timing)
+        q = _angles(biped, pelvis, ankles, time)
         error = pelvis[:, :2] + biped.chains.frames(q.reshape(len(q), 2, -1)).com[:, :2] - com
         pelvis[:, :2] -= error
         if np.abs(error).max() < _COM_TOLERANCE_M:
@@ -167,15 +166,15 @@ def _pelvis_under(com: Array, standing: Array, biped: Biped, ankles: Array, timi
     )
 
 
-def _angles(biped: Biped, pelvis: Array, ankles: Array, timing: Timing) -> Array:
+def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
     try:
         return biped.joint_angles(pelvis, ankles)
     except ElasticError:
         distance = np.linalg.norm(ankles - pelvis[:, None] - biped.hips, axis=-1)
         row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
         raise ConfigurationError(
-            f"the {('left', 'right')[leg]} foot is out of reach at {timing.time[row]:.3f} s: {distance[row, leg]:.4f} m "
-            f"from the hip to the ankle, at most {biped.leg.reach:g} m; lower hip_height_m, or shift the ZMP less"
+            f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s: {distance[row, leg]:.4f} "
+            f"m from the hip to the ankle, at most {biped.leg.reach:g} m; lower hip_height_m, or shift the ZMP less"
         ) from None
 
 
