@@ -19,7 +19,8 @@ class Compensated:
     The compensation grows from zero in the first `ramp_s` of an episode, while the reference stands.
 
     Args:
-        policy: Anything with `predict`; its state may be anything.
+        policy: Anything with `predict`; its state may be anything. One that does not read joint rates can say so by an
+            attribute `reads_rates = False`, which saves their estimate.
         compensator: Where the motor has to lead, and where the link is.
         ramp_s: Duration of the ramp.
     """
@@ -32,6 +33,7 @@ class Compensated:
     ) -> None:
         self.policy, self.compensator = policy, compensator
         model = compensator.model
+        self._shows_rates = getattr(policy, "reads_rates", True)
         self._view = ObservationView(model.observation_table)
         self._ramp = Ramp(model, ramp_s)
 
@@ -48,7 +50,11 @@ class Compensated:
         memory, inner_state = resume(
             state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1, 0)))
         )
-        action, inner_state = self._inner(compensator, rows, inner_state, episode_start, deterministic, observation.ndim, memory)
+        seen = self._seen(compensator, rows, memory[:, 1:])
+        action, inner_state = self.policy.predict(
+            seen if observation.ndim > 1 else seen[0], inner_state, episode_start, deterministic
+        )
+        action = np.atleast_2d(np.asarray(action, dtype=np.float64))
         offset, kept = compensator.offset(desired.shifted(action), memory[:, 1:])
         steps = memory[:, :1] + 1.0
         total = (action + self._ramp.share(steps) * offset).astype(np.float32)
@@ -61,21 +67,8 @@ class Compensated:
         estimate = self.compensator.at(rows).link_angle(self._view.theta(rows), memory[:, 1:])
         return estimate.reshape((*observation.shape[:-1], estimate.shape[-1]))
 
-    def _inner(
-        self,
-        compensator: Compensator,
-        rows: Array,
-        state: Any,
-        episode_start: Any,
-        deterministic: bool,
-        ndim: int,
-        memory: Array,
-    ) -> tuple[Array, Any]:
-        """The wrapped policy's action on an observation whose encoder columns are those of the links."""
+    def _seen(self, compensator: Compensator, rows: Array, memory: Array) -> Array:
+        """The observations with the links' angles and rates where they have the encoders'."""
         theta, theta_dot = self._view.theta(rows), self._view.theta_dot(rows)
-        q = compensator.link_angle(theta, memory[:, 1:])
-        if state is not None and getattr(compensator, "_output", "") in ("taylor", "newton") and hasattr(self.policy, "windup"):
-            q = q - self.policy.windup(state)
-        seen = self._view.with_links(rows, q, compensator.link_rate(theta, theta_dot))
-        action, state = self.policy.predict(seen if ndim > 1 else seen[0], state, episode_start, deterministic)
-        return np.atleast_2d(np.asarray(action, dtype=np.float64)), state
+        rate = compensator.link_rate(theta, theta_dot) if self._shows_rates else theta_dot
+        return self._view.with_links(rows, compensator.link_angle(theta, memory), rate)

@@ -10,7 +10,7 @@ from typing import Literal, Protocol, get_args
 
 import numpy as np
 
-from baselines.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
+from baselines.gravity_torque import GravityMethod, GravityModel, LegGravity, make_dynamics, make_gravity, make_load
 from elastic_env.elasticity import solve_stiffness, static_deflection, static_link_angle
 from elastic_env.errors import unknown_name
 from elastic_env.robots.robot_model import RobotModel
@@ -62,8 +62,7 @@ def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
     Raises:
         ElasticError: The matrix is singular.
     """
-    K = np.broadcast_to(stiffness, theta.shape)
-    return theta - solve_stiffness(K, gravity.gravity_gradient(theta), gravity.gravity_torque(theta))
+    return theta - _solve(gravity, theta, stiffness, gravity.gravity_torque(theta))
 
 
 def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
@@ -152,9 +151,8 @@ class GravityCompensator:
         """See `Compensator`: the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇ at the estimated link angle."""
         if self._output == "none":
             return theta_dot
-        K = np.broadcast_to(self.stiffness, theta.shape)
         q = self.link_angle(theta, theta)
-        return solve_stiffness(K, self._load.gravity_gradient(q), K * theta_dot)
+        return _solve(self._load, q, self.stiffness, self.stiffness * theta_dot)
 
 
 class DynamicCompensator:
@@ -256,6 +254,16 @@ class DynamicCompensator:
         settled = _first_order(windup, effort / ki, self._kp / ki, self._dt)
         error = np.where(has_integrator, effort - ki * settled, effort) / self._kp
         return error, np.where(has_integrator, settled, 0.0)
+
+
+def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:
+    """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg where the legs do not couple, (..., n) [rad]."""
+    K = np.broadcast_to(stiffness, q.shape)
+    if not isinstance(gravity, LegGravity):
+        return solve_stiffness(K, gravity.gravity_gradient(q), torque)
+    blocks = gravity.gradient_by_leg(q)
+    by_leg = blocks.shape[:-1]
+    return solve_stiffness(K.reshape(by_leg), blocks, torque.reshape(by_leg)).reshape(q.shape)
 
 
 def _first_order(state: Array, target: Array, time_constant_s: Array, period_s: float) -> Array:

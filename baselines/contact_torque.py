@@ -17,11 +17,17 @@ from typing import Literal
 
 import numpy as np
 
-from elastic_env.elasticity import solve_stiffness
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
 from elastic_env.walking.contact_force import shares
-from elastic_env.walking.leg_chains import LegFrames, cross, holding_torque, holding_torque_gradient
+from elastic_env.walking.leg_chains import (
+    LegChains,
+    LegFrames,
+    cross,
+    holding_torque,
+    holding_torque_gradient,
+    rotated,
+)
 
 ContactMethod = Literal["com", "ankle", "lumped"]
 
@@ -84,15 +90,13 @@ class BoundContactGravity:
         return torque.reshape(q.shape)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """See `GravityModel`; the legs do not couple."""
-        frames = self._weighing(q)
-        return _block_diagonal(holding_torque_gradient(frames, self._gravity, self._force, self._points(frames)))
+        """See `GravityModel`."""
+        return _block_diagonal(self.gradient_by_leg(q))
 
-    def solve(self, q: Array, stiffness: Array, torque: Array) -> Array:
-        """(K + ∂τ_g/∂q)⁻¹ τ leg by leg, (num_worlds, 12)."""
+    def gradient_by_leg(self, q: Array) -> Array:
+        """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
         frames = self._weighing(q)
-        gradient = holding_torque_gradient(frames, self._gravity, self._force, self._points(frames))
-        return _solve_by_leg(gradient, stiffness, torque)
+        return holding_torque_gradient(frames, self._gravity, self._force, self._points(frames))
 
     def _weighing(self, q: Array) -> LegFrames:
         frames = self._frames.at(q)
@@ -101,7 +105,7 @@ class BoundContactGravity:
         return LegFrames(frames.axes, frames.anchors, np.zeros_like(frames.levers), frames.foot_R, frames.com)
 
     def _points(self, frames: LegFrames) -> Array:
-        return frames.ankle + (frames.foot_R * self._in_sole[..., None, :]).sum(axis=-1)
+        return frames.ankle + rotated(frames.foot_R, self._in_sole)
 
 
 class WrenchTorque:
@@ -135,37 +139,29 @@ class BoundWrenchTorque:
         """See `GravityModel`."""
         frames = self._frames.at(q)
         force, moment = self._force_and_moment(frames)
-        load = cross(frames.levers, self._gravity[..., None, None, :])
-        load = load + cross(frames.ankle[..., None, :] - frames.anchors, force[..., None, :]) + moment[..., None, :]
-        return -(frames.axes * load).sum(axis=-1).reshape(q.shape)
+        torque = holding_torque(frames, self._gravity, force, frames.ankle, moment)
+        return torque.reshape(q.shape)
 
     def gravity_gradient(self, q: Array) -> Array:
         """See `GravityModel`; not symmetric, since the wrench turns with its foot."""
-        return _block_diagonal(self._gradient(q))
+        return _block_diagonal(self.gradient_by_leg(q))
 
-    def solve(self, q: Array, stiffness: Array, torque: Array) -> Array:
-        """(K + ∂τ/∂q)⁻¹ τ leg by leg, (num_worlds, 12)."""
-        return _solve_by_leg(self._gradient(q), stiffness, torque)
-
-    def _gradient(self, q: Array) -> Array:
+    def gradient_by_leg(self, q: Array) -> Array:
+        """∂τ/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
         frames = self._frames.at(q)
-        zero = np.zeros((*q.shape[:-1], _LEGS, 3))
-        legs = holding_torque_gradient(frames, self._gravity, zero, zero)
         force, moment = self._force_and_moment(frames)
+        # the weight of the leg: the Hessian of a potential
+        legs = holding_torque_gradient(frames, self._gravity, np.zeros_like(force), frames.ankle)
+        # the wrench: a joint beyond i turns foot, force and moment under joint i; one before i turns all together
         arm = frames.ankle[..., None, :] - frames.anchors
-        turned_arm = cross(frames.axes, arm)
-        turned_force = cross(frames.axes, force[..., None, :])
-        turned_moment = cross(frames.axes, moment[..., None, :])
-        own = cross(turned_arm, force[..., None, :]) + turned_moment
-        # joint j beyond i turns the foot under joint i: its arm, its force and its moment; before i all turn together
-        product = frames.axes @ own.swapaxes(-1, -2)
-        product = product + cross(frames.axes, arm) @ turned_force.swapaxes(-1, -2)
-        return legs - np.triu(product, 1)
+        turned = cross(cross(frames.axes, arm), force[..., None, :]) + cross(frames.axes, moment[..., None, :])
+        load = frames.axes @ turned.swapaxes(-1, -2)
+        load += cross(frames.axes, arm) @ cross(frames.axes, force[..., None, :]).swapaxes(-1, -2)
+        return legs - np.triu(load, 1)
 
     def _force_and_moment(self, frames: LegFrames) -> tuple[Array, Array]:
-        force = (frames.foot_R * self._wrench[..., 0, None, :]).sum(axis=-1)
-        moment = (frames.foot_R * self._wrench[..., 1, None, :]).sum(axis=-1)
-        return force, moment
+        """Of each foot on its leg in the frame of the pelvis, (num_worlds, 2, 3) each."""
+        return rotated(frames.foot_R, self._wrench[..., 0, :]), rotated(frames.foot_R, self._wrench[..., 1, :])
 
 
 class PlannedTorque:
@@ -207,10 +203,13 @@ class BoundPlannedTorque:
 class _Memo:
     """Frames of the last joint angles: torque and gradient are asked for at the same ones."""
 
-    def __init__(self, chains) -> None:
-        self._chains, self._q, self._frames = chains, None, None
+    def __init__(self, chains: LegChains) -> None:
+        self._chains = chains
+        self._q: Array | None = None
+        self._frames: LegFrames | None = None
 
     def at(self, q: Array) -> LegFrames:
+        """Frames at joint angles, (num_worlds, 12) [rad]."""
         if self._frames is None or self._q is not q:
             self._q, self._frames = q, self._chains.frames(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
         return self._frames
@@ -223,8 +222,3 @@ def _block_diagonal(blocks: Array) -> Array:
     for leg in range(L):
         full[..., leg * J : (leg + 1) * J, leg * J : (leg + 1) * J] = blocks[..., leg, :, :]
     return full
-
-
-def _solve_by_leg(gradient: Array, stiffness: Array, torque: Array) -> Array:
-    K = np.broadcast_to(stiffness, torque.shape).reshape(*torque.shape[:-1], _LEGS, _PER_LEG)
-    return solve_stiffness(K, gradient, torque.reshape(K.shape)).reshape(torque.shape)

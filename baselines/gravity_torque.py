@@ -4,7 +4,7 @@
 NumPy for a whole batch at once. Both agree to rounding.
 """
 
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -29,6 +29,15 @@ class GravityModel(Protocol):
 
     def gravity_gradient(self, q: Array) -> Array:
         """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
+        ...
+
+
+@runtime_checkable
+class LegGravity(GravityModel, Protocol):
+    """A gravity torque whose gradient has one block per leg."""
+
+    def gradient_by_leg(self, q: Array) -> Array:
+        """∂τ_g/∂q of each leg, (..., n) [rad] to (..., legs, n / legs, n / legs) [N·m/rad]."""
         ...
 
 
@@ -64,9 +73,11 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         ConfigurationError: The method does not exist, or not for this robot.
     """
     if isinstance(model, WalkerModel):
-        if method is not None and method not in get_args(ContactMethod):
-            raise unknown_name("gravity method of a walker", method, get_args(ContactMethod))
-        return ContactGravity(model, method or "com")
+        if method is None:
+            return ContactGravity(model)
+        if method == "com" or method == "ankle" or method == "lumped":
+            return ContactGravity(model, method)
+        raise unknown_name("gravity method of a walker", method, get_args(ContactMethod))
     if method in (None, "pinocchio"):
         return FixedGravity(RigidBody(model.rigid, model.joint_names))
     if method == "batched":

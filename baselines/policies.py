@@ -113,17 +113,21 @@ def policy_names() -> list[str]:
 def make(name: str, env: Any, **options: Any) -> Policy:
     """A named baseline for an environment.
 
-    | name | what it does on the testbed |
-    |---|---|
-    | `zero`, `uncompensated` | plays the reference back |
-    | `input` | Eq. 9 on the command, Eq. 12 (or Newton) on the encoder |
-    | `dynamic` | deflection from the full joint torque, with D, B and the servo inverted |
-    | `oracle` | true parameters, integral action on the true link error |
+    | name | on the testbed | on the walker |
+    |---|---|---|
+    | `zero` | plays the reference back | the same |
+    | `uncompensated` | the same | walking controller alone, which takes motors for links |
+    | `input` | Eq. 9 on the command, Eq. 12 (or Newton) on the encoder | Eq. 9 around the controller |
+    | `input_output` | - | also Eq. 12: the controller sees the estimated links |
+    | `input_wrench` | - | the estimate takes the measured foot wrenches instead of the planned load share |
+    | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
+    | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
+    | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
 
     Args:
         name: As in the table.
         env: The environment, scalar or vector, wrapped or not; it provides the assumed model.
-        **options: Parameters of `PolicyOptions`: stiffness, output, gravity, ramp_s.
+        **options: Parameters of `PolicyOptions`, such as stiffness, output, gravity, com_feedback, gains.
 
     Returns:
         An object with `predict`, usable on scalar and vector environments and in SB3's `evaluate_policy`.
@@ -141,7 +145,7 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     model, chosen = _assumed(env, PolicyOptions(**options)), PolicyOptions(**options)
     known = _ON_THE_WALKER if isinstance(model, WalkerModel) else _ON_THE_TESTBED
     if name not in known:
-        raise unknown_name(f"policy of {type(env.unwrapped.task).__name__}", name, known)
+        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, known)
     return known[name](env, model, chosen)
 
 

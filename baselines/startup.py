@@ -1,8 +1,8 @@
 r"""How a compensation grows from zero while the robot stands.
 
-The spring-loaded robot begins in static equilibrium without compensation; the compensated one stands elsewhere. A walker
-that is moved there within the second of standing would be left swinging on its springs, so its ramp is shaped [Singer1990]:
-two equal halves, half a period of its slowest sway apart, whose swings cancel.
+The robot begins in static equilibrium without compensation; the compensated one stands elsewhere. A walker that is
+moved there within the second of standing would be left swinging on its springs, so its ramp is shaped [Singer1990]: two
+equal halves, half a period of its slowest sway apart, whose swings cancel.
 
 [Singer1990] N. C. Singer, W. P. Seering, "Preshaping Command Inputs to Reduce System Vibration", J. Dyn. Sys., Meas.,
 Control 112(1).
@@ -12,7 +12,7 @@ import numpy as np
 
 from elastic_env.plan import quintic
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
-from elastic_env.signals import Array
+from elastic_env.signals import Array, BoolArray
 from elastic_env.walking.sway import sway_frequencies
 
 _SHORTEST_SHARE = 0.2
@@ -40,7 +40,7 @@ class Ramp:
         time, each = steps * self._period_s, self._duration - self._delay
         return 0.5 * (quintic(time / each)[0] + quintic((time - self._delay) / each)[0])
 
-    def is_over(self, steps: Array) -> Array:
+    def is_over(self, steps: Array) -> BoolArray:
         """Whether the compensation is complete."""
         return steps * self._period_s >= self._duration
 

@@ -1,13 +1,19 @@
 r"""The walking controller: foot force difference control, and feedback of the center of mass from joint angles.
 
-It commands offsets of the joints around the planned walk. Where a joint is, it takes from the encoder columns of the
+* Foot force difference control [Kajita2010]: the leg that carries too little grows,
+  ż = k ((F_l − F_r)_ref − (F_l − F_r)) − z/T, half of z on each side.
+* Feedback of the center of mass: the error of the divergent component of motion ξ = c + ċ/ω asks for a ZMP shift
+  Δp = k (ξ − ξ_ref), which the ankles produce by winding their springs, Δτ/K.
+* Dry friction of the joints that the plan moves is wound against likewise, F/K in the direction of the planned rate;
+  F is what an identification found.
+
+All are offsets of the joints around the planned walk. Where a joint is, it takes from the encoder columns of the
 observation, so that an output compensator around it (`baselines.Compensated`) shows it links instead of motors.
 
 Local frame: at the sole of the step's support foot, level, its place in the plan's world that of the planned foothold,
 re-taken at every support change. The center of mass in it follows from joint angles and the attitude of the IMU.
 
-[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS: foot force
-difference control, and the ZMP from the divergent component of motion ξ = c + ċ/ω.
+[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
 """
 
 from dataclasses import dataclass
@@ -51,9 +57,10 @@ class LocalFrame:
     com: Array
     soles: Array
 
-    def com_in(self, foot: Array) -> Array:
-        """Center of mass relative to the sole of a foot of every world, (num_worlds, 3) [m]."""
-        return self.com - self.soles[np.arange(len(foot)), foot]
+    @property
+    def com_from_soles(self) -> Array:
+        """Center of mass relative to each sole, (num_worlds, 2, 3) [m]."""
+        return self.com[:, None] - self.soles
 
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
@@ -67,7 +74,7 @@ def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
 class WalkingController:
     """Commands a walker around its plan, see the module.
 
-    Memory per world: steps, leg length difference, COM relative to both feet, COM velocity, ZMP shift.
+    Memory per world: steps, leg length difference, COM from both soles, COM velocity, ZMP shift.
 
     Args:
         model: Assumed walker.
@@ -75,6 +82,9 @@ class WalkingController:
         gains: Gains.
         ramp_s: Time in which the feedback grows from zero [s].
     """
+
+    reads_rates = False
+    """It needs no joint rates: the velocity of the center of mass is the change of its position."""
 
     def __init__(
         self,
@@ -96,29 +106,28 @@ class WalkingController:
         self._friction_deflection = model.coulomb_friction / model.stiffness
 
     def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True  # noqa: ARG002
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,  # noqa: ARG002
     ) -> tuple[Action, Any]:
         """Offsets of the twelve joints [rad], and new state."""
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        steps, z, last, velocity, shift, _ = np.split(memory, [1, 2, 6, 8, 10], axis=1)
+        steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
         steps = steps + 1.0
         share, _, _ = quintic(steps / self._ramp_steps)
         z = self._leg_difference(rows, z)
-        coms = (frame.com[:, None] - frame.soles)[..., :2]
+        coms = frame.com_from_soles[..., :2]
         if self._com_feedback:
             velocity, shift = self._zmp_shift(rows, coms, last.reshape(coms.shape), velocity, shift)
-        windup = share * self._ankle_offsets(rows, shift)
-        action = share * self._leg_offsets(rows, z) + windup
-        action = action + self._friction_offsets(rows)
-        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, windup])
+        feedback = share * (self._leg_offsets(rows, z) + self._ankle_offsets(rows, shift))
+        action = feedback + self._friction_offsets(rows)
+        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift])
         action = action.astype(np.float32)
         return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
-
-    def windup(self, state: Any) -> Array:
-        """Part of the last action that winds springs instead of moving links, (num_worlds, 12) [rad]."""
-        return state[0][:, 10:]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
         """The encoder angles, (..., 12) [rad]: without an output compensator it takes motors for links."""
@@ -126,9 +135,9 @@ class WalkingController:
         return self._view.theta(rows).reshape((*observation.shape[:-1], -1))
 
     def _begin(self, frame: LocalFrame) -> Array:
-        coms = (frame.com[:, None] - frame.soles)[..., :2].reshape(len(frame.com), 4)
+        coms = frame.com_from_soles[..., :2].reshape(len(frame.com), 4)
         zero = np.zeros((len(coms), 1))
-        return np.hstack([zero, zero, coms, zero, zero, zero, zero, np.zeros((len(coms), 12))])
+        return np.hstack([zero, zero, coms, zero, zero, zero, zero])
 
     def _leg_difference(self, rows: Array, z: Array) -> Array:
         """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
@@ -172,7 +181,7 @@ class WalkingController:
         return offsets.reshape(len(rows), 12)
 
     def _friction_offsets(self, rows: Array) -> Array:
-        """Offsets that wind the springs against the dry friction of joints that the plan moves, (num_worlds, 12) [rad]."""
+        """Offsets that wind the springs against the friction of joints that the plan moves, (num_worlds, 12) [rad]."""
         return self._friction_deflection * np.tanh(self._view.motion(rows).q_dot / self._gains.friction_rate_rad_s)
 
     def _ankle_offsets(self, rows: Array, shift: Array) -> Array:

@@ -42,10 +42,6 @@ class Model(BaseModel):
         except ValidationError as error:
             raise ConfigurationError(_explain(type(self), error)) from None
 
-    def __hash__(self) -> int:
-        """Frozen, so it can be the key of a cache; only models of numbers and names can be hashed."""
-        return hash((type(self), *(getattr(self, name) for name in type(self).model_fields)))
-
     def replace(self, **changes: Any) -> Self:
         """A validated copy with some parameters changed."""
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})

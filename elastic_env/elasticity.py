@@ -170,12 +170,21 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
     n = stiffness.shape[-1]
     # every row by its own stiffness: the size of K says nothing about singularity
     relative = torque_gradient / stiffness[..., None] + np.eye(n)
-    determinant = relative[..., 0, 0] if n == 1 else np.linalg.det(relative)
+    if n == 1:
+        _require_regular(relative[..., 0, 0], stiffness)
+        return torque / stiffness / relative[..., 0]
+    try:
+        solution = np.linalg.solve(relative, (torque / stiffness)[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        solution = np.full_like(torque, np.inf)
+    if not (np.abs(solution) < np.pi).all():  # no deflection: worth a closer look
+        _require_regular(np.linalg.det(relative), stiffness)
+    return solution
+
+
+def _require_regular(determinant: Array, stiffness: Array) -> None:
     if (np.abs(determinant) < np.finfo(np.float64).eps).any():
         raise ElasticError(
             "K + ∂τ_g/∂q is singular: gravity cancels the stiffness "
             f"(smallest K {stiffness.min():.6g} N·m/rad); a stiffer joint or a lighter load is needed"
         )
-    if n == 1:
-        return torque / stiffness / determinant[..., None]
-    return np.linalg.solve(relative, (torque / stiffness)[..., None])[..., 0]

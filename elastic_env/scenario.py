@@ -85,9 +85,13 @@ CHANGES: dict[str, Change] = {
 """Parameters that a change sets on its ground."""
 
 
-def scenario_names() -> list[str]:
-    """Names that `make_scenario` accepts, joined names aside."""
-    return [*GROUNDS, *CHANGES]
+WALKER_ONLY = ("spread", "push", "slope")
+"""Changes that the single joint of the testbed does not know."""
+
+
+def scenario_names(testbed: bool = False) -> list[str]:
+    """Names that `make_scenario` accepts, joined names aside; those of the testbed if asked."""
+    return [*GROUNDS, *(name for name in CHANGES if not (testbed and name in WALKER_ONLY))]
 
 
 def make_scenario(name: "str | Scenario") -> Scenario:

@@ -336,7 +336,7 @@ def test_make_and_make_vec_find_the_environments() -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scenario", [*scenario_names(), "ideal+soft", "ideal+backlash", "ideal+sensor"])
+@pytest.mark.parametrize("scenario", [*scenario_names(testbed=True), "ideal+soft", "ideal+backlash", "ideal+sensor"])
 @pytest.mark.parametrize("reference", [*SHORT, "raised"])
 def test_an_episode_starts_in_static_equilibrium(reference: str, scenario: str) -> None:
     """Catches a start with slack springs or an empty integrator: under zero action nothing may move."""
@@ -670,7 +670,10 @@ def test_an_unstable_plant_diverges_by_itself() -> None:
     ("arguments", "message"),
     [
         ({"scenario": "nominl"}, r"unknown scenario 'nominl'; choose one of: ideal, nominal, soft, .*'nominal'"),
-        ({"scenario": "ideal+sof"}, r"unknown scenario 'sof'; choose one of: ideal, nominal, soft, stiff, payload"),
+        (
+            {"scenario": "ideal+sof"},
+            r"unknown scenario 'sof'; choose one of: ideal, nominal, soft, stiff, spread, payload",
+        ),
         ({"scenario": ""}, r"unknown scenario ''; choose one of: ideal"),
         ({"scenario": "soft+ideal"}, r"'soft\+ideal': 'ideal' is a ground and can only stand first"),
         ({"reference": "sin"}, r"unknown reference 'sin'; choose one of: hold, sine, multisine, steps.*'sine'"),

@@ -18,6 +18,7 @@ class Task(Protocol):
     command → disturb → (physics) → sense → signals, scored, reward_terms, failures, finished → observe
     """
 
+    name: str
     model: mujoco.MjModel
     num_worlds: int
     num_substeps: int

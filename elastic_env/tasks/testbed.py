@@ -96,6 +96,7 @@ class TestbedTask:
 
     __test__ = False
 
+    name = "testbed"
     action_table = ACTION
     metrics: Sequence[Metric] = METRICS
 

@@ -1,8 +1,9 @@
 """Parameters of the testbed task, and what they must fulfil together."""
 
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
+from pydantic import model_validator
 
 from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint
@@ -11,7 +12,7 @@ from elastic_env.references import Hold, Reference
 from elastic_env.robots.dynamixel import H54_200_S500_R
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.robots.testbed import JOINT, Pendulum, rigid_spec
-from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.scenario import Scenario, make_scenario, scenario_names
 from elastic_env.signals import SignalTable
 
 
@@ -40,6 +41,16 @@ class TestbedConfig(Model):
     control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
     timestep_s: float = quantity("s", 5e-4, gt=0, description="physics step")
     reward: RewardWeights = RewardWeights()
+
+    @model_validator(mode="after")
+    def _scenario_acts(self) -> Self:
+        acting = [name for name in ("stiffness_spread", "push_n", "slope_rad") if getattr(self.scenario, name) > 0.0]
+        if acting:
+            raise ValueError(
+                f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker knows; on the testbed "
+                f"choose from: {', '.join(scenario_names(testbed=True))}"
+            )
+        return self
 
     @property
     def true_joint(self) -> ElasticJoint:

@@ -64,6 +64,7 @@ def zmp_penalty(zmp_deviation: Array) -> Array:
 class WalkTask:
     """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.tasks.task.Task`."""
 
+    name = "walker"
     action_table = ACTION
     observation_table = OBSERVATION
     assumed_model: RobotModel
@@ -73,8 +74,8 @@ class WalkTask:
         self.config = config
         self.num_worlds = num_worlds
         self.num_substeps = _num_substeps(config)
-        robot = biped(config.robot)
-        self.plan = plan_walk(config.gait, robot, config.control_period_s)
+        robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+        self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
         model = self.assumed_model = WalkerModel(
             config.assumed_joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
         )
@@ -372,7 +373,7 @@ class WalkTask:
 
 def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
     """The true joints and masses, and the torques that the planned motion needs of them."""
-    true = biped(config.true_robot)
+    true = biped(config.true_robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     plan = plan if config.true_robot == config.robot else with_torque(plan, true, config.control_period_s)
     return WalkerModel(config.true_joints, true.rigid, config.control_period_s, OBSERVATION, biped=true, plan=plan)
 

@@ -17,6 +17,7 @@ It is symmetric, the Hessian of a potential. Legs do not couple: the pelvis' ori
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -75,23 +76,35 @@ class LegChains:
 
     def frames(self, q: Array) -> LegFrames:
         """Forward kinematics of all legs, (..., L, J) [rad]."""
-        batch, (L, J) = q.shape[:-2], self._mass.shape
-        sine, cosine = np.sin(q), np.cos(q)
-        axes, anchors, moments = np.empty((3, *batch, L, J, 3))
-        R = np.zeros((*batch, L, 3, 3))
-        R[..., (0, 1, 2), (0, 1, 2)] = 1.0
-        anchor = np.zeros((*batch, L, 3))
+        shape, J = q.shape[:-1], q.shape[-1]
+        sine, cosine = np.moveaxis(np.sin(q), -1, 0), np.moveaxis(np.cos(q), -1, 0)
+        # joints and components come first in memory, so that every operation runs over whole batches
+        axes, anchors = np.empty((2, J, 3, *shape))
+        columns = np.zeros((3, 3, *shape))  # of the orientation of the last link
+        columns[0, 0] = columns[1, 1] = columns[2, 2] = 1.0
+        links = np.empty((J, 3, 3, *shape))
+        anchor = np.zeros((3, *shape))
         for j in range(J):
-            anchor = anchor + (R * self._offset[:, j, None, :]).sum(axis=-1)
+            anchor = _displaced(anchor, columns, self._offset[:, j])
             axis = self._axis[j]
-            axes[..., j, :] = R[..., axis]
-            R = _turned(R, axis, sine[..., j, None], cosine[..., j, None])
-            anchors[..., j, :] = anchor
-            com = anchor + (R * self._ipos[:, j, None, :]).sum(axis=-1)
-            moments[..., j, :] = self._mass[:, j, None] * com
-        carried = np.cumsum(moments[..., ::-1, :], axis=-2)[..., ::-1, :]
-        com = (self._trunk_moment + carried[..., 0, :].sum(axis=-2)) / self.mass
-        return LegFrames(axes, anchors, carried - self._carried[..., None] * anchors, R, com)
+            first, second = _OTHERS[axis]
+            axes[j], anchors[j], turned = columns[axis], anchor, links[j]
+            turned[axis] = columns[axis]
+            turned[first] = cosine[j] * columns[first] + sine[j] * columns[second]
+            turned[second] = cosine[j] * columns[second] - sine[j] * columns[first]
+            columns = turned
+        ipos = self._ipos.T.reshape(3, J, *[1] * (len(shape)), -1)
+        coms = anchors + links[:, 0] * ipos[0] + links[:, 1] * ipos[1] + links[:, 2] * ipos[2]
+        mass, below = (x.T.reshape(J, *[1] * len(shape), -1) for x in (self._mass, self._carried))
+        carried = np.cumsum((mass * coms)[::-1], axis=0)[::-1]
+        com = (self._trunk_moment + np.moveaxis(carried[0], 0, -1).sum(axis=-2)) / self.mass
+        return LegFrames(
+            axes=_vectors_last(axes),
+            anchors=_vectors_last(anchors),
+            levers=_vectors_last(carried - below * anchors),
+            foot_R=np.moveaxis(columns, (0, 1), (-1, -2)),
+            com=com,
+        )
 
     def _moment_of_the_rest(self, model: mujoco.MjModel, bodies: IntArray) -> Array:
         """First moment of all bodies that are no leg, in the pelvis frame [kg·m]."""
@@ -117,35 +130,62 @@ def holding_torque(frames: LegFrames, gravity: Array, force: Array, point: Array
         τ, (..., L, J) [N·m].
     """
     load = cross(frames.levers, gravity[..., None, None, :])
-    load = load + cross(point[..., None, :] - frames.anchors, force[..., None, :])
+    load += cross(point[..., None, :] - frames.anchors, force[..., None, :])
     if moment is not None:
-        load = load + moment[..., None, :]
-    return -(frames.axes * load).sum(axis=-1)
+        load += moment[..., None, :]
+    return -dot(frames.axes, load)
 
 
 def holding_torque_gradient(frames: LegFrames, gravity: Array, force: Array, point: Array) -> Array:
     """∂τ/∂q of `holding_torque` with the force fixed in space and its point fixed in the foot, (..., L, J, J)."""
     turned = cross(cross(frames.axes, frames.levers), gravity[..., None, None, :])
-    turned = turned + cross(cross(frames.axes, point[..., None, :] - frames.anchors), force[..., None, :])
+    turned += cross(cross(frames.axes, point[..., None, :] - frames.anchors), force[..., None, :])
     product = -(frames.axes @ turned.swapaxes(-1, -2))
-    upper = np.triu(product)
-    return upper + np.triu(product, 1).swapaxes(-1, -2)
+    J = product.shape[-1]
+    return product * _upper(J, 0) + (product * _upper(J, 1)).swapaxes(-1, -2)
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Vector product over the last axis; several times as fast as NumPy's on small batches."""
+    """Vector product over the last axis, in the memory order of its larger argument, which makes it fast."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    x = ay * bz - az * by
+    like = a if a.shape[:-1] == x.shape else b
+    product = np.empty_like(like) if like.shape[:-1] == x.shape else np.empty((*x.shape, 3))
+    product[..., 0], product[..., 1], product[..., 2] = x, az * bx - ax * bz, ax * by - ay * bx
+    return product
 
 
-def _turned(R: Array, axis: int, sine: Array, cosine: Array) -> Array:
-    """R times a rotation about one of its own axes."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    turned = R.copy()
-    turned[..., first] = cosine * R[..., first] + sine * R[..., second]
-    turned[..., second] = cosine * R[..., second] - sine * R[..., first]
-    return turned
+def dot(a: Array, b: Array) -> Array:
+    """Scalar product over the last axis of three components."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def rotated(R: Array, v: Array) -> Array:
+    """R v, (..., 3, 3) and (..., 3) to (..., 3)."""
+    return R[..., 0] * v[..., 0, None] + R[..., 1] * v[..., 1, None] + R[..., 2] * v[..., 2, None]
+
+
+_OTHERS = {0: (1, 2), 1: (2, 0), 2: (0, 1)}
+
+
+@cache
+def _upper(size: int, diagonal: int) -> Array:
+    """Ones above a diagonal, the diagonal included."""
+    return np.triu(np.ones((size, size)), diagonal)
+
+
+def _vectors_last(array: Array) -> Array:
+    """A view with joints and components last, (J, 3, ..., L) to (..., L, J, 3)."""
+    return np.moveaxis(array, (0, 1), (-2, -1))
+
+
+def _displaced(origin: Array, columns: Array, offset: Array) -> Array:
+    """A point of each leg's link, (3, ..., L), from its offset in the link, (L, 3)."""
+    for column, component in zip(columns, offset.T, strict=True):
+        if component.any():
+            origin = origin + column * component
+    return origin
 
 
 def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:
