@@ -1,5 +1,7 @@
-"""Pictures of the testbed: shape and type, and that one sees in them what they are for."""
+"""Pictures: shape and type, and that one sees in them what they are for."""
 
+from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -9,11 +11,16 @@ import pytest
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.errors import ConfigurationError
-from elastic_env.rendering import EXAGGERATION, TestbedPicture, exaggerated
+from elastic_env.rendering import EXAGGERATION, LARGEST_FACTOR, TestbedPicture, WalkerPicture, exaggerated
+from elastic_env.rendering.walker import Posture, enlarged
 from elastic_env.robots.testbed import Pendulum
 from elastic_env.signals import Array, Signals
+from elastic_env.tasks.walk_config import WalkConfig
+from elastic_env.tasks.walk_in_place import WalkTask
+from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
 
 ID = "elastic_env/Testbed-v0"
+WALKER_ID = "elastic_env/WalkInPlace-v0"
 CAPTION_ROWS = 60
 """Rows at the top, which hold clock and numbers."""
 
@@ -89,15 +96,16 @@ def test_environment_returns_rgb_pictures_that_change_with_the_motion() -> None:
     assert np.any(pictures[-1][CAPTION_ROWS:] != pictures[0][CAPTION_ROWS:])
 
 
-def test_rendering_does_not_change_the_rollout() -> None:
+@pytest.mark.parametrize(("environment", "arguments"), [(ID, {"reference": "sine"}), (WALKER_ID, {})])
+def test_rendering_does_not_change_the_rollout(environment: str, arguments: dict[str, Any]) -> None:
     """Catches a picture that steps or moves the physics."""
     results = []
     for render_mode in (None, "rgb_array"):
-        env = gymnasium.make(ID, render_mode=render_mode, reference="sine")
+        env = gymnasium.make(environment, render_mode=render_mode, **arguments)
         env.reset(seed=0)
-        for _ in range(20):
-            observation, *_ = env.step(np.full(1, 0.01, dtype=np.float32))
-            if render_mode is not None:
+        for step in range(20):
+            observation, *_ = env.step(np.full(env.action_space.shape, 0.01, dtype=np.float32))
+            if render_mode is not None and step % 10 == 0:
                 env.render()
         results.append(observation)
         env.close()
@@ -182,3 +190,240 @@ def test_drawing_model_hangs_like_the_testbed(picture: TestbedPicture) -> None:
     reach = Pendulum().com_distance
     np.testing.assert_allclose(bob[[0, 2]], [reach * np.sin(0.6), -reach * np.cos(0.6)], atol=1e-9)
     assert model.joint("reference").type == mujoco.mjtJoint.mjJNT_HINGE
+
+
+ROW = 600
+"""A row of the plan in which the left foot carries the robot."""
+
+
+@pytest.fixture(scope="module")
+def walk() -> WalkTask:
+    """The rules of a walk, of which no step is simulated."""
+    return WalkTask(WalkConfig(), num_worlds=1)
+
+
+class Walker:
+    """A walker's picture of any posture: what the task says of its state is said by the test."""
+
+    def __init__(self, walk: WalkTask) -> None:
+        self.walk = walk
+        self.robot = walk.truth().model.biped
+        self.planned = Posture.planned(walk.plan, ROW)
+        self.fell = False
+        task: Any = SimpleNamespace(
+            config=walk.config,
+            plan=walk.plan,
+            truth=lambda: self.truth,
+            failures=lambda: {"fell": np.array([self.fell])},
+        )
+        self.picture = WalkerPicture(task)
+
+    def posture(self, roll: float = 0.0, pitch: float = 0.0, shift: float = 0.0, feet: float = 0.0) -> Posture:
+        """The planned posture with a tilt [rad] and a shift to the left [m] of the pelvis, and one of the feet [m]."""
+        left = np.array([0.0, 1.0, 0.0])
+        tilt = rotation_x(np.array(roll)) @ rotation_y(np.array(pitch))
+        planned = self.planned
+        return Posture(planned.pelvis + shift * left, tilt, planned.ankles + feet * left, planned.feet_R)
+
+    def stand(self, fell: bool = False, **deviations: float) -> Posture:
+        """Let the robot have a posture."""
+        true = self.posture(**deviations)
+        self.fell = fell
+        self.truth = SimpleNamespace(
+            pelvis=true.pelvis[None], pelvis_R=true.R[None], ankles=true.ankles[None],
+            q=true.joint_angles(self.robot)[None], model=self.walk.truth().model,
+        )  # fmt: skip
+        return true
+
+    def signals(self, zmp: tuple[float, float] = (0.3, 0.0), reference: tuple[float, float] = (0.0, 0.105)) -> Signals:
+        """Signals of the task that go with it, so far as they are drawn."""
+        deviation = float(np.hypot(zmp[0] - reference[0], zmp[1] - reference[1]))
+        timing = self.walk.plan.timing
+        values = {
+            "time_s": timing.time[ROW], "single_support": timing.single[ROW], "support": timing.support[ROW],
+            "pelvis_roll": 0.01, "pelvis_pitch": -0.02, "zmp_deviation": deviation, "zmp_x": zmp[0], "zmp_y": zmp[1],
+            "zmp_reference_x": reference[0], "zmp_reference_y": reference[1],
+        }  # fmt: skip
+        return {name: np.array([value]) for name, value in values.items()}
+
+    def scene(self, **points: tuple[float, float]) -> Array:
+        """The picture, white where its words are."""
+        image = self.picture.rgb(self.signals(**points)).astype(np.float64)
+        image[:90] = image[-40:] = 255.0
+        return image
+
+    def caption(self, **points: tuple[float, float]) -> list[str]:
+        """The words that go with the picture."""
+        signals = self.signals(**points)
+        self.picture._update(signals)
+        return self.picture._caption(signals)
+
+    def pixel(self, point: tuple[float, float, float]) -> Array:
+        """Row and column at which a point is seen."""
+        model, data = self.picture._model, self.picture._data
+        eye, R = data.cam("front").xpos, data.cam("front").xmat.reshape(3, 3)
+        right, up, back = (np.array(point) - eye) @ R
+        height, width = model.vis.global_.offheight, model.vis.global_.offwidth
+        focus = 0.5 * height / np.tan(0.5 * np.radians(model.cam_fovy[0]))
+        return np.array([0.5 * height + focus * up / back, 0.5 * width - focus * right / back])
+
+
+@pytest.fixture(scope="module")
+def walker(walk: WalkTask) -> Any:
+    """One picture of the walker for all tests."""
+    drawn = Walker(walk)
+    yield drawn
+    drawn.picture.close()
+
+
+def magenta(image: Array) -> Array:
+    """Rows and columns of the pixels of the ZMP's marker."""
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return np.argwhere((red > 120.0) & (green < 0.35 * red) & (blue > 0.3 * red))
+
+
+def test_tilt_and_shift_of_the_pelvis_are_enlarged_and_the_feet_stay(walker: Walker) -> None:
+    """Catches a deviation drawn as it is, a pelvis enlarged about the wrong point, and feet that leave the floor."""
+    true, planned = walker.posture(roll=0.02, shift=0.01), walker.planned
+    drawn, factor = enlarged(true, planned, 0.0, walker.robot, largest=4.0)
+    assert factor == 4.0
+    np.testing.assert_allclose(drawn.R, rotation_x(np.array(0.08)), atol=1e-12)
+    np.testing.assert_allclose(drawn.pelvis, planned.pelvis + np.array([0.0, 0.04, 0.0]), atol=1e-12)
+    np.testing.assert_array_equal(drawn.ankles, true.ankles)
+
+
+def test_robot_that_stands_elsewhere_is_not_tilted(walker: Walker) -> None:
+    """Catches a pelvis that is pulled away from feet that slipped as far as it did."""
+    true = walker.posture(shift=0.03, feet=0.03)
+    for share in (0.0, 0.4, 1.0):
+        drawn, _ = enlarged(true, walker.planned, share, walker.robot)
+        np.testing.assert_allclose(drawn.pelvis, true.pelvis, atol=1e-12)
+
+
+def test_factor_is_as_large_as_the_legs_allow(walker: Walker) -> None:
+    """Catches a fall drawn with legs that are too short: the factor ends at one, which is the truth."""
+    tilts = np.linspace(0.0, 0.4, 9)
+    postures = [walker.posture(roll=-tilt, shift=0.6 * tilt) for tilt in tilts]
+    factors = [enlarged(true, walker.planned, 0.0, walker.robot)[1] for true in postures]
+    assert factors[0] == LARGEST_FACTOR
+    assert all(before >= after >= 1.0 for before, after in pairwise(factors))
+    assert factors[-1] < 2.0
+
+
+@pytest.mark.parametrize("deviations", [{}, {"roll": 0.03, "pitch": -0.02, "shift": 0.01, "feet": 0.005}])
+def test_drawn_feet_are_where_the_true_ones_are(walker: Walker, deviations: dict[str, float]) -> None:
+    """Catches joint angles that do not belong to the posture, by MuJoCo's own kinematics."""
+    true = walker.stand(**deviations)
+    walker.picture._update(walker.signals())
+    data = walker.picture._data
+    for side, ankle in zip("lr", true.ankles, strict=True):
+        np.testing.assert_allclose(data.body(f"{side}_foot").xpos, ankle, atol=1e-9)
+        np.testing.assert_allclose(data.body(f"{side}_foot").xmat.reshape(3, 3), np.eye(3), atol=1e-9)
+    roll, pitch = deviations.get("roll", 0.0), deviations.get("pitch", 0.0)
+    drawn = data.body("upper_body").xmat.reshape(3, 3)
+    assert drawn[2, 1] == pytest.approx(LARGEST_FACTOR * roll, rel=0.02)
+    assert -drawn[2, 0] == pytest.approx(LARGEST_FACTOR * pitch, rel=0.02)
+
+
+def test_translucent_robot_is_the_plan(walker: Walker) -> None:
+    """Catches a plan of another row, and one that moves with the robot."""
+    walker.stand(roll=0.05)
+    walker.picture._update(walker.signals())
+    rigid = walker.robot.rigid
+    data, plan = mujoco.MjData(rigid), walker.walk.plan
+    data.qpos[:3], data.qpos[3:7] = plan.pelvis[ROW], [1.0, 0.0, 0.0, 0.0]
+    for joint, angle in zip(walker.robot.joint_names, plan.q[ROW], strict=True):
+        data.joint(joint).qpos = angle
+    mujoco.mj_kinematics(rigid, data)
+    for body in ("upper_body", "l_foot", "r_shank", "r_foot"):
+        np.testing.assert_allclose(walker.picture._data.body(f"plan_{body}").xpos, data.body(body).xpos, atol=1e-9)
+
+
+def edges(image: Array) -> Array:
+    """First and last column in which one sees head and chest of the robot."""
+    darker = (image[100:250] < 190.0).any(axis=(0, 2))
+    return np.flatnonzero(darker)[[0, -1]]
+
+
+def test_walker_that_leans_to_its_right_is_seen_to_lean_to_the_left(walker: Walker) -> None:
+    """Catches a mirrored tilt, and a camera behind the robot, which looks at the camera."""
+    walker.stand()
+    upright = edges(walker.scene())
+    walker.stand(roll=0.04)  # about x, forward: the head moves towards -y, the robot's right
+    to_the_left = edges(walker.scene())
+    walker.stand(roll=-0.04)
+    to_the_right = edges(walker.scene())
+    assert to_the_left[0] < upright[0] - 10
+    assert to_the_right[1] > upright[1] + 10
+
+
+def test_marker_of_the_zmp_is_where_the_zmp_is(walker: Walker) -> None:
+    """Catches a marker of something else, swapped axes, and one that is enlarged like the pelvis."""
+    walker.stand(roll=0.02)
+    for zmp in ((0.3, 0.0), (0.2, 0.3)):
+        seen = magenta(walker.scene(zmp=zmp))
+        assert len(seen) > 50
+        np.testing.assert_allclose(seen.mean(axis=0), walker.pixel((*zmp, 0.02)), atol=4.0)
+
+
+def test_marker_of_the_reference_is_where_the_reference_is(walker: Walker) -> None:
+    """Catches a reference that stands still: only the pixels around the two places differ."""
+    walker.stand()
+    places = ((0.35, -0.1), (0.3, 0.25))
+    one, other = (walker.scene(reference=place, zmp=(0.0, 0.0)) for place in places)
+    changed = np.argwhere(np.abs(one - other).max(axis=-1) > 20.0)
+    assert len(changed) > 200
+    distances = [np.linalg.norm(changed - walker.pixel((*place, 0.01)), axis=1) for place in places]
+    assert np.min(distances, axis=0).max() < 25.0
+    assert all((distance < 25.0).sum() > 100 for distance in distances)
+
+
+def test_without_ground_contact_there_is_no_zmp(walker: Walker) -> None:
+    """Catches a marker at an old or a meaningless place, and a caption with nan."""
+    walker.stand()
+    nowhere = (np.nan, np.nan)
+    assert len(magenta(walker.scene(zmp=nowhere))) == 0
+    assert "nan" not in " ".join(walker.caption(zmp=nowhere))
+
+
+def test_caption_of_the_walker_says_what_is_drawn(walker: Walker) -> None:
+    """Catches another phase, number or factor than that of the picture, and a fall that nobody mentions."""
+    walker.stand()
+    first, second, third = walker.caption(zmp=(0.0, 0.095))
+    assert first.split() == ["t", "=", "2.40", "s", "left", "support"]
+    assert second.split() == ["roll", "+10.0", "mrad", "pitch", "-20.0", "mrad", "ZMP", "deviation", "10.0", "mm"]
+    assert f"x {LARGEST_FACTOR:g} " in third
+    true = walker.stand(fell=True, roll=-0.1, shift=0.05)
+    first, _, third = walker.caption()
+    assert "fell" in first
+    factor = enlarged(true, walker.planned, walker.walk.plan.share[ROW], walker.robot)[1]
+    assert 1.0 < factor < LARGEST_FACTOR
+    assert f"x {factor:.2g} " in third
+
+
+def test_closed_picture_of_the_walker_keeps_nothing_and_draws_again(walk: WalkTask) -> None:
+    """Catches a renderer that is not freed, or used after it was."""
+    drawn = Walker(walk)
+    drawn.stand()
+    first = drawn.picture.rgb(drawn.signals())
+    drawn.picture.close()
+    drawn.picture.close()
+    assert drawn.picture._renderer is None
+    np.testing.assert_array_equal(drawn.picture.rgb(drawn.signals()), first)
+    drawn.picture.close()
+
+
+def test_walking_environment_renders_its_walk() -> None:
+    """Catches another shape or type, and a picture that stands still while the robot moves."""
+    env = gymnasium.make(WALKER_ID, step_period=1.1, num_steps=1, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    for _ in range(20):
+        env.step(np.full(12, 0.03, dtype=np.float32))
+    later = env.render()
+    env.close()
+    for image in (first, later):
+        assert isinstance(image, np.ndarray)
+        assert image.shape == (720, 720, 3)
+        assert image.dtype == np.uint8
+    assert np.any(first[90:] != later[90:])

@@ -1,0 +1,149 @@
+"""What all pictures share: a MuJoCo model that is only drawn, as an image with a caption or in a window."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeAlias
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.errors import ElasticError
+from elastic_env.headless import CURE
+from elastic_env.signals import Signals
+
+Image: TypeAlias = npt.NDArray[np.uint8]
+Rgba: TypeAlias = tuple[float, float, float, float]
+Legend: TypeAlias = Sequence[tuple[str, Rgba]]
+"""Words under a picture, each in the colour of what it names."""
+
+CAMERA = "front"
+"""The camera through which a display model is seen."""
+
+_BACKGROUND = (0.96, 0.97, 0.98)
+_TEXT_RGB = (30, 34, 40)
+_MARGIN = 12
+_CHARACTERS_PER_ROW = 37
+"""Width of a picture over the size of its letters."""
+
+
+class Picture(Protocol):
+    """Draws the present state of a task from its signals."""
+
+    def rgb(self, signals: Signals) -> Image:
+        """An image, (height, width, 3)."""
+        ...
+
+    def show(self, signals: Signals) -> None:
+        """Update the window."""
+        ...
+
+    def close(self) -> None:
+        """Free renderer and window."""
+        ...
+
+
+class ModelPicture(ABC):
+    """A `Picture` made from a display model, which is posed and never stepped.
+
+    Args:
+        spec: What is drawn, with a camera named `CAMERA`.
+        legend: Words under the image.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, legend: Legend) -> None:
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._legend = legend
+        self._renderer: Any = None
+        self._viewer: Any = None
+
+    @abstractmethod
+    def _pose(self, signals: Signals) -> None:
+        """Move the display model to the present state."""
+
+    @abstractmethod
+    def _caption(self, signals: Signals) -> list[str]:
+        """Lines of text for the state that was posed last."""
+
+    def rgb(self, signals: Signals) -> Image:
+        """See `Picture`."""
+        self._update(signals)
+        if self._renderer is None:
+            self._renderer = _renderer(self._model)
+        self._renderer.update_scene(self._data, camera=CAMERA)
+        return _with_text(self._renderer.render(), self._caption(signals), self._legend)
+
+    def show(self, signals: Signals) -> None:
+        """See `Picture`."""
+        self._update(signals)
+        if self._viewer is None:
+            self._viewer = _window(self._model, self._data)
+        corner, large = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtFontScale.mjFONTSCALE_150
+        self._viewer.set_texts([(large, corner, "\n".join(self._caption(signals)), "")])
+        self._viewer.sync()
+
+    def close(self) -> None:
+        """See `Picture`."""
+        if self._renderer is not None:
+            self._renderer.close()
+        if self._viewer is not None:
+            self._viewer.close()
+        self._renderer = self._viewer = None
+
+    def _update(self, signals: Signals) -> None:
+        self._pose(signals)
+        mujoco.mj_forward(self._model, self._data)
+
+
+def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:
+    """Size of the images [pixels], a light background, and soft light from the side of the camera."""
+    spec.compiler.degree = False
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.15] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    spec.visual.rgba.haze = [*_BACKGROUND, 1.0]
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=_BACKGROUND, rgb2=_BACKGROUND, width=64, height=64,
+    )  # fmt: skip
+
+
+def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
+    try:
+        import glfw  # only here: a machine that only computes may have neither GLFW nor a display
+        import mujoco.viewer as viewers
+    except (ImportError, RuntimeError) as error:
+        raise ElasticError(f"no window can be opened here ({error}); {CURE}") from error
+    if not glfw.init():  # the viewer itself would end the process
+        raise ElasticError(f"no window can be opened here; make a video (--video FILE) or use rgb_array; {CURE}")
+    viewer = viewers.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+    viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    viewer.cam.fixedcamid = model.camera(CAMERA).id
+    return viewer
+
+
+def _renderer(model: mujoco.MjModel) -> Any:
+    try:
+        return mujoco.Renderer(model, model.vis.global_.offheight, model.vis.global_.offwidth)
+    except Exception as error:  # MuJoCo's OpenGL backends raise errors of many types
+        raise ElasticError(f"the renderer could not start ({error}); {CURE}") from error
+
+
+def _with_text(image: Image, lines: list[str], legend: Legend) -> Image:
+    """The image with its caption above and its legend below."""
+    import PIL.Image  # Pillow comes with Gymnasium's MuJoCo extra
+    import PIL.ImageDraw
+    import PIL.ImageFont
+
+    picture = PIL.Image.fromarray(image)
+    draw = PIL.ImageDraw.Draw(picture)
+    size = picture.width // _CHARACTERS_PER_ROW
+    font = PIL.ImageFont.load_default(size=size)
+    for row, line in enumerate(lines):
+        draw.text((_MARGIN, 10 + row * 1.25 * size), line, fill=_TEXT_RGB, font=font)
+    x = float(_MARGIN)
+    for word, rgba in legend:
+        draw.text((x, picture.height - 1.6 * size), word, fill=tuple(round(255 * c) for c in rgba[:3]), font=font)
+        x += draw.textlength(word, font=font) + size
+    return np.asarray(picture)
