@@ -35,13 +35,13 @@ from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
 class WalkingGains(Model):
     """Gains of the walking controller."""
 
-    force_difference: float = quantity("m/(N·s)", 6e-4, ge=0, description="leg length difference per force difference")
+    force_difference: float = quantity("m/(N·s)", 8e-4, ge=0, description="leg length difference per force difference")
     force_difference_decay_s: float = quantity("s", 0.5, gt=0, description="time constant of its decay")
     force_difference_limit_m: float = quantity("m", 0.04, gt=0, description="largest difference of the leg lengths")
     dcm: float = quantity("1", 0.4, ge=0, description="ZMP shift per error of the divergent component of motion")
     zmp_limit_m: float = quantity("m", 0.06, gt=0, description="largest ZMP shift")
     velocity_filter_s: float = quantity("s", 0.05, gt=0, description="time constant of the COM velocity")
-    zmp_filter_s: float = quantity("s", 0.02, gt=0, description="time constant of the ZMP shift")
+    zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
     friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0, description="joint rate at which friction acts in full")
 
 

@@ -13,7 +13,7 @@ from elastic_env.signals import Array
 
 _DAMPER_TIME_S = 0.05
 """D/K while the robot settles [s]."""
-_REST_RATE = 1e-5
+_REST_RATE = 5e-5
 _CHECK_EVERY_S = 0.25
 _LONGEST_S = 20.0
 
