@@ -20,11 +20,11 @@ import yaml
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-import baselines
 import train.compare
 import train.demo
 import train.evaluate
 import train.speed
+import train.summary
 from baselines.identification import Identification
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError, ResultsExistError
@@ -282,13 +282,14 @@ def test_compare_leaves_configuration_and_origin_beside_its_results(compared: Co
 def test_compare_summarises_every_cell(compared: Compared) -> None:
     """Catches a median over the wrong episodes: table, Markdown and CSV must say the same."""
     rows = rows_of(compared.folder / "episodes.csv")
-    lines = (compared.folder / "summary.md").read_text().splitlines()
-    assert len(lines) == 4
-    for policy, line in zip(("uncompensated", "newton"), lines[2:], strict=True):
+    text = (compared.folder / "summary.md").read_text()
+    lines = [line for line in text.splitlines() if line.startswith("| multisine")]
+    assert len(lines) == 2
+    for policy, line in zip(("uncompensated", "newton"), lines, strict=True):
         values = [float(row["link_error_rms_rad"]) for row in rows if row["policy"] == policy]
         median = f"{1e3 * np.median(values):.2f}"
         assert median not in [f"{1e3 * value:.2f}" for value in values]
-        assert line.startswith(f"| multisine | soft | {policy} | {median} |")
+        assert line.startswith(f"| multisine | soft | {policy} | {median} ({1e3 * max(values):.2f}) |")
         assert line.endswith("| 0/2 |")
         assert any(policy in printed and median in printed for printed in compared.printed.splitlines())
 
@@ -314,7 +315,7 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
         for reason, value in (("", 0.001), ("diverged", 9.0), ("", 0.003), ("diverged", float("nan")))
     ]
     table = Console(width=160, record=True, file=StringIO())
-    table.print(train.compare.summary_table([Evaluation(condition(), episodes)]))
+    table.print(train.summary.summary_table([Evaluation(condition(), episodes)]))
     row = next(line for line in table.export_text().splitlines() if "input" in line)
     assert "2.00" in row
     assert "2/4" in row
@@ -391,13 +392,30 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "reference key": (
         {"name": "c", "references": [{"kind": "sine", "hz": 1}]}, ["'hz'", "frequency_hz", "amplitude"]
     ),
-    "environment": ({"name": "c", "env": "tesbed"}, ["'tesbed'", "testbed"]),
+    "environment": ({"name": "c", "env": "tesbed"}, ["'tesbed'", "testbed", "walker"]),
     "environment option": ({"name": "c", "env_options": {"stifness": 3}}, ["'stifness'", "stiffness", "pendulum"]),
     "no name": ({"policies": ["input"]}, ["name"]),
     "no policies": ({"name": "c", "policies": []}, ["policies"]),
     "no references": ({"name": "c", "references": []}, ["references"]),
     "no scenarios": ({"name": "c", "scenarios": []}, ["scenarios"]),
     "negative": ({"name": "c", "episodes": -1}, ["episodes", ">= 1", "-1"]),
+    "policy's environment option": (
+        {"name": "c", "policies": [{"name": "zero", "env_options": {"from": "rigid"}}]}, ["'from'", "form", "stiffness"]
+    ),
+    "reserved option": ({"name": "c", "env_options": {"step_period": 3}}, ["step_period", "keys of their own"]),
+    "reserved parameter": (
+        {"name": "c", "env": "walker", "references": [{"step_period": 3, "scenario": "ideal"}]},
+        ["scenario", "reference"],
+    ),
+    "no reference": ({"name": "c", "references": [None]}, ["reference", "name", "mapping", "None"]),
+    "policy of the figures": ({"name": "c", "figure_policies": ["inptu"]}, ["'inptu'", "uncompensated", "input"]),
+    "scenario with episodes": ({"name": "c", "scenario_episodes": {"ideal": 1}}, ["'ideal'", "nominal"]),
+    "no episodes": ({"name": "c", "scenario_episodes": {"nominal": 0}}, ["scenario_episodes", "nominal", ">= 1", "0"]),
+    "sweep": ({"name": "c", "sweep": {"option": "stiffness_scale", "values": [1]}}, ["values"]),
+    "sweep key": ({"name": "c", "sweep": {"options": "x", "values": [1, 2]}}, ["'options'", "option"]),
+    "swept option": (
+        {"name": "c", "sweep": {"option": "stiffnes", "values": [1, 2]}}, ["'stiffnes'", "stiffness_scale"]
+    ),
     "stiffness": ({"name": "c", "env_options": {"stiffness": -3}}, ["stiffness", "> 0", "[N·m/rad]", "-3"]),
     "no mapping": (["input"], ["mapping", "list"]),
 }  # fmt: skip
@@ -426,7 +444,14 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "reference text": (["evaluate", "--reference", "{kind: sine"], ["{kind: sine"]),
     "unit": (["evaluate", "--reference", "{kind: sine, amplitude: -1}"], ["amplitude", "> 0", "[rad]", "-1"]),
     "infeasible": (["evaluate", "--reference", "{kind: sine, frequency_hz: 9}"], ["84.0 N·m", "amplitude"]),
-    "environment": (["evaluate", "--env", "walker"], ["'walker'", "testbed"]),
+    "environment": (["evaluate", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
+    "walk": (["evaluate", "--env", "walker", "--reference", "5"], ["step_period", "24, 3, 1.6, 1.1", "5"]),
+    "walk mapping": (["evaluate", "--env", "walker", "--reference", "{steps: 2}"], ["'step_period'", "num_steps"]),
+    "walk argument": (
+        ["evaluate", "--env", "walker", "--reference", "{step_period: 3, steps: 2}"],
+        ["'steps'", "num_steps", "gait"],
+    ),
+    "walk policy": (["evaluate", "--env", "walker", "--policy", "inptu"], ["'inptu'", "input_output", "input_wrench"]),
     "episodes": (["evaluate", "--episodes", "0"], ["episodes", ">= 1"]),
     "seed": (["evaluate", "--seed", "-1"], ["seed", ">= 0", "-1"]),
     "assumed": (["evaluate", "--stiffness", "-5"], ["stiffness", "> 0", "[N·m/rad]", "-5"]),
@@ -441,11 +466,13 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "identify masses": (["identify", "--second-mass", "0"], ["mass", "> 0"]),
     "identify equal masses": (["identify", "--second-mass", "1"], ["mass"]),
     "play scenario": (["play", "--scenario", "sof", "--video", "x.gif"], ["'sof'", "soft"]),
-    "play environment": (["play", "--env", "walker", "--video", "x.gif"], ["'walker'", "testbed"]),
+    "play environment": (["play", "--env", "wlaker", "--video", "x.gif"], ["'wlaker'", "testbed", "walker"]),
     "play format": (["play", "--video", "x.txt", "--max-s", "0.1"], [".mp4", ".gif", "x.txt"]),
     "play time": (["play", "--video", "x.gif", "--max-s", "-1"], ["max", "-1"]),
     "speed worlds": (["speed", "--num-envs", "0"], ["num_envs", "0"]),
     "speed steps": (["speed", "--num-envs", "2", "--steps", "0"], ["steps", "0"]),
+    "speed environment": (["speed", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
+    "speed policy": (["speed", "--num-envs", "2", "--policy", "inptu"], ["'inptu'", "input", "oracle"]),
     "speed rounds": (["speed", "--num-envs", "2", "--steps", "1", "--rounds", "0"], ["rounds", "0"]),
 }
 
@@ -482,6 +509,9 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
     [
         (["--help"], ["identify", "evaluate", "compare", "speed", "play"]),
         (["evaluate", "--help"], ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"]),
+        (["evaluate", "--help"], ["walker", "input_wrench", "step_period", "num_steps", "push"]),
+        (["play", "--help"], ["walker", "--reference", ".mp4"]),
+        (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
         (["compare", "--help"], ["configs/", "episodes.csv", "--jobs"]),
         (["identify", "--help"], ["--second-mass", "N·m/rad", "identification.json"]),
     ],
@@ -576,14 +606,17 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     """Catches a demonstration that breaks on the way; with short references, so that it takes seconds."""
     monkeypatch.setattr(train.demo, "_STATIC", train.demo._STATIC.replace(references=[HOLD]))
     monkeypatch.setattr(train.demo, "_MOTION", train.demo._MOTION.replace(references=[SINE]))
+    short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
+    monkeypatch.setattr(train.demo, "_WALK", train.demo._WALK.replace(references=[short_walk]))
     main(["demo"])
     printed = capsys.readouterr().out
-    names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json"}
+    walks = {"pelvis_0.3+0.5+0.3_s_nominal.png", "zmp_0.3+0.5+0.3_s_nominal.png"}
+    names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json", *walks}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}
     assert [name for name in names if f"runs/demo/{name}" not in printed] == []
-    assert [
-        text for text in ("Pearson r", "0.9775", "-56.2 to +41.7", *baselines.policy_names()[1:]) if text not in printed
-    ] == []
+    of_the_paper = ("Pearson r", "0.9775", "-56.2 to +41.7", "about 40", "below 10")
+    policies = ("uncompensated", "input", "dynamic", "oracle", "input_output", "input_wrench")
+    assert [text for text in (*of_the_paper, *policies) if text not in printed] == []
 
 
 def test_work_that_fails_without_a_result_leaves_no_folder(tmp_path: Path) -> None:

@@ -53,17 +53,22 @@ class Identify:
 class Evaluate:
     """Play episodes of one policy under one scenario and print its metrics.
 
-    Example: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
+    Examples: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
+    elastic evaluate --env walker --policy input_wrench --reference 3
     """
 
     policy: str = "input"
-    """Baseline (zero, uncompensated, input, dynamic, oracle), or "module:function" for one's own."""
+    """Baseline, or "module:function" for one's own. Baselines: zero, uncompensated, input, dynamic, oracle; on the
+    walker also uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
-    """Environment."""
+    """Environment: testbed (one joint) or walker (a humanoid that walks in place)."""
     scenario: str = "nominal"
-    """Scenario, such as nominal, ideal, soft, stiff, payload, backlash, sensor, ideal+soft."""
-    reference: str = "hold"
-    """Reference: hold, sine, multisine, steps; or a mapping such as '{kind: sine, amplitude: 0.3}'."""
+    """Scenario, such as nominal, ideal, soft, stiff, payload, backlash, sensor, ideal+soft; on the walker also spread,
+    push, slope."""
+    reference: str | None = None
+    """Motion. Testbed: hold (default), sine, multisine, steps, or a mapping such as '{kind: sine, amplitude: 0.3}'.
+    Walker: step period 24, 3 (default), 1.6 or 1.1 [s], or durations [s] of double, single and double support such as
+    '[0.8, 0.6, 0.8]', or a mapping such as '{step_period: 3, num_steps: 2}'."""
     episodes: int = 1
     """Number of episodes, seeds following --seed."""
     seed: int = 0
@@ -80,7 +85,7 @@ class Evaluate:
 
         options = {} if self.stiffness is None else {"stiffness": _number_or_path(self.stiffness)}
         config = CompareConfig(
-            name="evaluate", env=self.env, references=[_name_or_mapping(self.reference)], scenarios=[self.scenario],
+            name="evaluate", env=self.env, references=[_motion(self.env, self.reference)], scenarios=[self.scenario],
             policies=[PolicySpec(name=self.policy, options=options)], episodes=self.episodes, seed=self.seed,
         )  # fmt: skip
         _print_files(compare(config, _CONSOLE, self.output))
@@ -91,7 +96,7 @@ class Compare:
     """Compare policies × scenarios × references × seeds as a configuration says.
 
     Writes episodes.csv (one row per episode), summary.md and figures beside the resolved configuration, seed, versions
-    and commit. Example: elastic compare configs/testbed.yaml
+    and commit. Examples: elastic compare configs/testbed.yaml; elastic compare configs/paper.yaml (the paper's walks)
     """
 
     config: Annotated[Path, tyro.conf.Positional]
@@ -110,8 +115,15 @@ class Compare:
 
 @dataclass
 class Speed:
-    """Measure the vector environment against raw mj_step on the same model, in one interleaved run."""
+    """Measure the vector environment against raw mj_step on the same model, in one interleaved run.
 
+    Example, with a policy in the loop: elastic speed --env walker --policy input_wrench --num-envs 64
+    """
+
+    env: str = "testbed"
+    """Environment: testbed or walker."""
+    policy: str | None = None
+    """Baseline in the loop of the vector environment, or "module:function"; none by default."""
     num_envs: list[int] = field(default_factory=lambda: [64, 1024])
     """Numbers of worlds."""
     steps: int = 50
@@ -136,17 +148,18 @@ class Play:
     """Watch one episode: in a window in real time, or with --video as a file.
 
     Deviations from the reference are drawn enlarged, by a factor that the picture shows.
-    Example: elastic play --policy input --reference sine --video sine.mp4
+    Examples: elastic play --policy input --reference sine --video sine.mp4
+    elastic play --env walker --policy input_output --video walk.mp4
     """
 
     policy: str = "uncompensated"
-    """Baseline, or "module:function" for one's own."""
+    """Baseline, or "module:function" for one's own; see elastic evaluate --help."""
     env: str = "testbed"
-    """Environment."""
+    """Environment: testbed or walker."""
     scenario: str = "nominal"
     """Scenario."""
-    reference: str = "sine"
-    """Reference: hold, sine, multisine, steps; or a mapping such as '{kind: sine, amplitude: 0.3}'."""
+    reference: str | None = None
+    """Motion, as in elastic evaluate; default sine on the testbed, step period 3 on the walker."""
     seed: int = 0
     """Seed of the episode."""
     video: Path | None = None
@@ -156,13 +169,12 @@ class Play:
 
     def run(self) -> None:
         """Play."""
-        from train.evaluate import ENVIRONMENTS, Condition, PolicySpec
+        from train.evaluate import Condition, PolicySpec
         from train.play import play
 
-        if self.env not in ENVIRONMENTS:
-            raise ConfigurationError(f"unknown environment {self.env!r}; choose one of: {', '.join(ENVIRONMENTS)}")
+        reference = "sine" if self.reference is None and self.env == "testbed" else self.reference
         condition = Condition(
-            env=self.env, policy=PolicySpec(name=self.policy), reference=_name_or_mapping(self.reference),
+            env=self.env, policy=PolicySpec(name=self.policy), reference=_motion(self.env, reference),
             scenario=self.scenario, seed=self.seed,
         )  # fmt: skip
         play(condition, _CONSOLE, self.video, self.max_s)
@@ -170,7 +182,7 @@ class Play:
 
 @dataclass
 class Demo:
-    """The paper's two testbed experiments and a motion, in under a minute, with pictures."""
+    """The paper's experiments in short, on testbed and walker, in under two minutes, with pictures."""
 
     output: Path | None = None
     """Folder for the results, new or empty; default runs/demo, numbered if taken."""
@@ -210,14 +222,21 @@ def main(arguments: list[str] | None = None) -> None:
         os._exit(130)  # worker processes must not keep the terminal waiting
 
 
-def _name_or_mapping(text: str) -> str | dict[str, Any]:
+def _motion(env: str, text: str | None) -> Any:
+    """A reference as it is written: a name, a number, durations or a mapping; the environment's default for None."""
+    from train.environments import environment
+
+    default = environment(env).default_reference
+    if text is None:
+        return default
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
         raise ConfigurationError(
-            f"{text!r} is neither a name nor a mapping such as '{{kind: sine, amplitude: 0.3}}'"
+            f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "
+            "'{step_period: 3, num_steps: 2}'"
         ) from None
-    return value if isinstance(value, dict) else text
+    return value if isinstance(value, int | float | list | dict) else text
 
 
 def _number_or_path(text: str) -> float | str:

@@ -1,47 +1,32 @@
 """Policies × scenarios × references × seeds under one protocol: one tidy CSV, a summary table, figures."""
 
-import csv
-import multiprocessing
-import os
-import queue
-import re
-import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing.managers import SyncManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-import numpy as np
-from pydantic import Field, field_validator
-from rich import box
+from pydantic import Field, field_validator, model_validator
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from elastic_env.config import Model, quantity
-from elastic_env.errors import ConfigurationError
+from elastic_env.errors import ConfigurationError, unknown_name
 from train import plots
-from train.evaluate import (
-    Condition,
-    Evaluation,
-    PolicySpec,
-    evaluate,
-    make_policy,
-    make_vector_env,
-    num_steps,
-)
+from train.environments import Environment, Reference, environment
+from train.evaluate import Condition, Evaluation, Motion, PolicySpec, make_policy, make_vector_env
+from train.figures import draw_figures
 from train.runs import run_folder
+from train.summary import print_summary, write_episodes, write_summary
+from train.workers import run_conditions
 
-_SUMMARY = (
-    ("rms", "link_error_rms_rad"),
-    ("peak", "link_error_peak_rad"),
-    ("IMU-", "link_error_imu_min_rad"),
-    ("IMU+", "link_error_imu_max_rad"),
-    ("est.", "link_estimate_error_rms_rad"),
-)
+
+class Sweep(Model):
+    """An option of the policies that takes several values, for curves instead of time series."""
+
+    option: str
+    """Option of the policies, such as stiffness_scale."""
+    values: list[float] = Field(min_length=2)
+    label: str | None = None
+    """What the axis says; None for the option's name."""
 
 
 class CompareConfig(Model):
@@ -50,17 +35,29 @@ class CompareConfig(Model):
     name: str = Field(pattern=r"^[\w.-]*\w$")
     """Name of the result folder under runs/: letters, digits, dots, dashes."""
     env: str = "testbed"
-    references: list[str | dict[str, Any]] = Field(default=["hold"], min_length=1)
-    """References by name, or mappings with `kind` and parameters."""
+    references: list[Motion] = Field(min_length=1)
+    """Motions, see `Condition.reference`; default the environment's."""
     scenarios: list[str] = Field(default=["nominal"], min_length=1)
     policies: list[PolicySpec] = Field(
         default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1
     )
-    """Baselines by name, or mappings with name, label and options."""
+    """Baselines by name, or mappings with name, label, options, and env_options of their own."""
     episodes: int = quantity("1", 1, ge=1, description="episodes per cell")
+    scenario_episodes: dict[str, int] = {}
+    """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
     seed: int = quantity("1", 0, ge=0, description="seed of the first episode")
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
+    figure_policies: list[str] = []
+    """Policies that the time series show, by label or name; all if empty."""
+    sweep: Sweep | None = None
+    """An option of the policies to vary."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _environment_has_a_default(cls, values: Any) -> Any:
+        name = values.get("env", "testbed") if isinstance(values, dict) else None
+        return {"references": [environment(name).default_reference], **values} if isinstance(name, str) else values
 
     @field_validator("policies", mode="before")
     @classmethod
@@ -69,18 +66,47 @@ class CompareConfig(Model):
             [{"name": item} if isinstance(item, str) else item for item in value] if isinstance(value, list) else value
         )
 
+    @model_validator(mode="after")
+    def _names_exist(self) -> Self:
+        environment(self.env)
+        titles = [policy.title for policy in self.policies]
+        for title in self.figure_policies:
+            if title not in titles:
+                raise unknown_name("policy of the figures", title, titles)
+        for scenario, episodes in self.scenario_episodes.items():
+            if scenario not in self.scenarios:
+                raise unknown_name("scenario with episodes of its own", scenario, self.scenarios)
+            if episodes < 1:
+                raise ConfigurationError(f"scenario_episodes of {scenario!r} must be >= 1, got {episodes}")
+        return self
+
     def conditions(self) -> list[Condition]:
-        """All cells, in the order reference, scenario, policy."""
+        """All cells, in the order reference, scenario, policy, swept value."""
         return [
             Condition(
-                env=self.env, policy=policy, reference=reference, label=label, scenario=scenario,
-                env_options=self.env_options,
-                episodes=self.episodes, seed=self.seed,
+                env=self.env, policy=policy, reference=reference, label=label, scenario=scenario, swept=swept,
+                env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
+                seed=self.seed,
             )
-            for reference, label in zip(self.references, _reference_labels(self.references), strict=True)
+            for reference, label in zip(self.references, self._reference_labels(), strict=True)
             for scenario in self.scenarios
             for policy in self.policies
+            for swept in self._swept(policy)
         ]  # fmt: skip
+
+    def _swept(self, policy: PolicySpec) -> list[dict[str, float]]:
+        if self.sweep is None or policy.level:
+            return [{}]
+        return [{self.sweep.option: value} for value in self.sweep.values]
+
+    def _reference_labels(self) -> list[str | None]:
+        """Names that tell references of one kind apart by their parameters; None where the kind is enough."""
+        known = environment(self.env)
+        kinds = [known.label(reference) for reference in self.references]
+        return [
+            " ".join([kind, *_parameters(reference, known)]) if kinds.count(kind) > 1 else None
+            for kind, reference in zip(kinds, self.references, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -109,186 +135,29 @@ def compare(config: CompareConfig, console: Console, output: Path | None = None,
         raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {jobs}")
     plots.require_matplotlib()
     conditions = config.conditions()
-    for condition in conditions:
-        _try_out(condition)
+    try_out(conditions)
     with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:
         evaluations = run_conditions(conditions, console, jobs)
-        files = [_write_csv(evaluations, folder / "episodes.csv"), _write_summary(evaluations, folder / "summary.md")]
-        files += _draw(evaluations, folder)
-    console.print(summary_table(evaluations))
+        files = [write_episodes(evaluations, folder / "episodes.csv")]
+        files.append(write_summary(evaluations, folder / "summary.md"))
+        axis = None if config.sweep is None else config.sweep.label or config.sweep.option
+        files += draw_figures(evaluations, folder, config.figure_policies, axis)
+    print_summary(evaluations, console)
     return Comparison(folder, evaluations, files)
 
 
-def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
-    """Evaluate conditions in processes of their own, with one progress bar for all.
-
-    The results do not depend on the number of processes.
-    """
-    jobs = min(jobs or os.cpu_count() or 1, len(conditions))
-    total = sum(num_steps(condition) for condition in conditions)
-    context = multiprocessing.get_context("spawn")
-    manager = SyncManager(ctx=context)
-    manager.start(_ignore_interrupts)
-    with _progress(console) as bar, manager:
-        task = bar.add_task("control steps", total=total)
-        steps = manager.Queue()
-        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
-        try:
-            futures = [pool.submit(_evaluate_in_process, condition, steps) for condition in conditions]
-            while not all(future.done() for future in futures):
-                for advance in _drain(steps):
-                    bar.advance(task, advance)
-                _raise_first(futures)
-            results = [future.result() for future in futures]
-        except BaseException:
-            _end(pool)
-            raise
-        pool.shutdown()
-        bar.update(task, completed=total)
-    return results
+def try_out(conditions: Sequence[Condition]) -> None:
+    """Make environments and policies once, so that a wrong name fails before anything runs."""
+    for condition in conditions:
+        env = make_vector_env(condition, 1)
+        policy = make_policy(condition.policy, env, condition.policy_options)
+        if not hasattr(policy, "predict"):
+            raise ConfigurationError(
+                f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
+            )
 
 
-def summary_table(evaluations: Sequence[Evaluation]) -> Table:
-    """Median over the episodes of every cell, angles in mrad, failures beside them, never averaged in."""
-    table = Table(
-        title=escape("link error [mrad], median over episodes"),
-        caption="IMU- and IMU+: range by the link's IMU; est.: rms error of the policy's estimate of the link angle",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )
-    for name in ("reference", "scenario", "policy"):
-        table.add_column(name, no_wrap=True)
-    for title, _ in _SUMMARY:
-        table.add_column(title, justify="right", no_wrap=True)
-    table.add_column("fail", justify="right", no_wrap=True)
-    previous = None
-    for evaluation in evaluations:
-        cell = evaluation.condition.reference_name, evaluation.condition.scenario
-        if previous is not None and cell != previous:
-            table.add_section()
-        shown = ("", "") if cell == previous else cell
-        previous = cell
-        table.add_row(*shown, evaluation.condition.policy.title, *_medians(evaluation), _failures(evaluation))
-    return table
-
-
-def _medians(evaluation: Evaluation) -> list[str]:
-    """Medians of the summary's metrics over the episodes that did not fail [mrad], - where there are none."""
-    completed = [episode for episode in evaluation.episodes if not episode["termination"]]
-    cells = []
-    for _, metric in _SUMMARY:
-        values = [episode[metric] for episode in completed if metric in episode]
-        cells.append(f"{1e3 * float(np.median(values)):.2f}" if values else "-")
-    return cells
-
-
-def _failures(evaluation: Evaluation) -> str:
-    failed = sum(1 for episode in evaluation.episodes if episode["termination"])
-    return f"{failed}/{len(evaluation.episodes)}"
-
-
-def _reference_labels(references: Sequence[str | dict[str, Any]]) -> list[str | None]:
-    """Names that tell references of one kind apart by their parameters; None where the kind is enough."""
-    kinds = [reference if isinstance(reference, str) else str(reference.get("kind")) for reference in references]
-    return [
-        " ".join([kind, *(f"{k}={v}" for k, v in reference.items() if k != "kind")])
-        if kinds.count(kind) > 1 and isinstance(reference, dict)
-        else None
-        for kind, reference in zip(kinds, references, strict=True)
-    ]
-
-
-def _try_out(condition: Condition) -> None:
-    """Make environment and policy once, so that a wrong name fails before anything runs."""
-    env = make_vector_env(condition, 1)
-    policy = make_policy(condition.policy, env)
-    if not hasattr(policy, "predict"):
-        raise ConfigurationError(
-            f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
-        )
-
-
-def _ignore_interrupts() -> None:
-    """In a worker: Ctrl-C reaches the whole process group, but the parent decides what happens."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _raise_first(futures: Sequence[Future[Evaluation]]) -> None:
-    """The error of a condition that failed, as soon as it has."""
-    for future in futures:
-        if future.done():
-            future.result()
-
-
-def _end(pool: ProcessPoolExecutor) -> None:
-    """Stop at once: what is queued is dropped, what runs is ended."""
-    workers = list(getattr(pool, "_processes", {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
-    for worker in workers:
-        worker.terminate()
-    for worker in workers:
-        worker.join()
-
-
-def _evaluate_in_process(condition: Condition, steps: "queue.Queue[int]") -> Evaluation:
-    return evaluate(condition, progress=steps.put, num_threads=1)
-
-
-def _drain(steps: "queue.Queue[int]") -> Iterator[int]:
-    """What has been put into the queue, waiting a little for the first."""
-    try:
-        yield steps.get(timeout=0.2)
-        while True:
-            yield steps.get_nowait()
-    except queue.Empty:
-        return
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-        console=console, transient=True,
-    )  # fmt: skip
-
-
-def _write_csv(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """One row per episode; columns are names with units."""
-    records = [episode for evaluation in evaluations for episode in evaluation.episodes]
-    columns = list(dict.fromkeys(name for record in records for name in record))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(records)
-    return path
-
-
-def _write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """The summary table as Markdown."""
-    titles = [f"{metric.removesuffix('_rad').replace('_', ' ')} [mrad]" for _, metric in _SUMMARY]
-    header = ["reference", "scenario", "policy", *titles, "failed"]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for e in evaluations:
-        cells = [e.condition.reference_name, e.condition.scenario, e.condition.policy.title, *_medians(e), _failures(e)]
-        lines.append("| " + " | ".join(cells) + " |")
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def _draw(evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
-    files = [plots.draw_overview(evaluations, "link_error_rms_rad", folder / "overview.png")]
-    for group in _groups(evaluations):
-        condition = group[0].condition
-        stem = re.sub(r"[^\w.=-]+", "_", f"{condition.reference_name}_{condition.scenario}")
-        files.append(plots.draw_time_series(group, folder / f"time_{stem}.png"))
-        if group[0].points is not None:
-            model = make_vector_env(condition, 1).unwrapped.assumed_model
-            files.append(plots.draw_static_errors(group, model, folder / f"static_{stem}.png"))
-    return files
-
-
-def _groups(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
-    """Evaluations of the same reference and scenario together."""
-    groups: dict[tuple[str, str], list[Evaluation]] = {}
-    for evaluation in evaluations:
-        groups.setdefault((str(evaluation.condition.reference), evaluation.condition.scenario), []).append(evaluation)
-    return list(groups.values())
+def _parameters(reference: Reference, known: Environment) -> list[str]:
+    if not isinstance(reference, dict):
+        return []
+    return [f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)]

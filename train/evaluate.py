@@ -3,38 +3,49 @@
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from pydantic import field_validator
+from pydantic import AfterValidator, field_validator
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.static_points import HoldRecorder, StaticPoints
 from elastic_env.config import Model, quantity
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.errors import ConfigurationError
+from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
-
-ENVIRONMENTS = {"testbed": "elastic_env/Testbed-v0"}
-"""Environments by the short names of the command line."""
-
-TRACED = (
-    "time_s",
-    "reference_angle",
-    "link_angle",
-    "link_angle_imu",
-    "deflection",
-    "link_error",
-    "link_error_imu",
-    "joint_torque",
-)
-"""Signals of the first episode that are kept."""
+from train.environments import ENVIRONMENTS, RESERVED, Environment, Reference, environment
+from train.support_changes import SupportChanges
 
 _MAX_WORLDS = 64
 
 Progress = Callable[[int], None]
+
+
+def _options(value: dict[str, Any]) -> dict[str, Any]:
+    motions = {known.motion for known in ENVIRONMENTS.values()}
+    taken = sorted(value.keys() & {*RESERVED, *motions})
+    if taken:
+        raise ValueError(f"{', '.join(taken)} cannot be given here but have keys of their own, or no place")
+    return value
+
+
+def _reference(value: Any) -> Reference:
+    if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
+        raise ValueError(
+            f"a reference is a name, a step period [s], three durations [s] or a mapping of parameters, got {value!r}"
+        )
+    taken = sorted(value.keys() & set(RESERVED)) if isinstance(value, dict) else []
+    if taken:
+        raise ValueError(f"{', '.join(taken)} cannot be part of a reference but have keys of their own, or no place")
+    return list(value) if isinstance(value, tuple) else value
+
+
+Motion = Annotated[Any, AfterValidator(_reference)]
+"""A `Reference`, checked when it is read."""
 
 
 class PolicySpec(Model):
@@ -45,6 +56,12 @@ class PolicySpec(Model):
     """How tables and figures call it; None for its name."""
     options: dict[str, Any] = {}
     """Keyword arguments of `baselines.make`, or of one's own function."""
+    env_options: dict[str, Any] = {}
+    """Arguments of the environment for this policy alone, such as form: rigid."""
+    level: bool = False
+    """In a sweep: whether it plays once without the swept option, as a level to compare with."""
+
+    _checked = field_validator("env_options")(_options)
 
     @property
     def title(self) -> str:
@@ -57,29 +74,41 @@ class Condition(Model):
 
     env: str = "testbed"
     policy: PolicySpec
-    reference: str | dict[str, Any] = "hold"
+    reference: Motion = "hold"
+    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
+    or a mapping with `step_period` and further arguments of the environment."""
     label: str | None = None
-    """How tables and figures call the reference; None for its kind."""
+    """How tables and figures call the reference; None for what the environment calls it."""
     scenario: str = "nominal"
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
+    swept: dict[str, float] = {}
+    """The policy's option that a sweep varies, and its value here."""
     episodes: int = quantity("1", 1, ge=1, description="number of episodes")
     seed: int = quantity("1", 0, ge=0, description="seed of the first episode; the next ones follow")
 
-    @field_validator("env_options")
-    @classmethod
-    def _options_are_not_taken(cls, value: dict[str, Any]) -> dict[str, Any]:
-        taken = sorted(value.keys() & {"reference", "scenario", "num_envs", "num_threads", "autoreset_mode"})
-        if taken:
-            raise ValueError(f"{', '.join(taken)} cannot be given here but have keys of their own, or no place")
-        return value
+    _checked = field_validator("env_options")(_options)
+
+    @property
+    def environment(self) -> Environment:
+        """What is known of the environment."""
+        return environment(self.env)
 
     @property
     def reference_name(self) -> str:
-        """Label or kind of the reference."""
-        if self.label is not None:
-            return self.label
-        return self.reference if isinstance(self.reference, str) else str(self.reference.get("kind"))
+        """Label of the reference, or what the environment calls it."""
+        return self.label or self.environment.label(self.reference)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the environment; what the policy says goes before, and what the reference says before that."""
+        motion = self.environment.arguments(self.reference)
+        return {"scenario": self.scenario, **self.env_options, **self.policy.env_options, **motion}
+
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """Options of the policy with the swept one."""
+        return {**self.policy.options, **self.swept}
 
 
 @dataclass
@@ -89,7 +118,7 @@ class Evaluation:
     Attributes:
         condition: The condition.
         episodes: Flat records, one per episode: seed, metrics, termination.
-        trace: Signals of the first episode over time, see `TRACED`.
+        trace: Signals of the first episode over time, those that the environment's description names.
         points: Static points of the first episode, with reference "hold".
         rest_references: References of the static points, (visits,) [rad].
     """
@@ -101,18 +130,35 @@ class Evaluation:
     rest_references: Array = field(default_factory=lambda: np.zeros(0))
 
     def values(self, metric: str) -> Array:
-        """A metric over the episodes."""
-        return np.array([episode[metric] for episode in self.episodes], dtype=np.float64)
+        """A metric over the episodes that did not fail, (n,); empty where none of them has it."""
+        found = [episode.get(metric) for episode in self.episodes if not episode["termination"]]
+        return np.array([value for value in found if value is not None], dtype=np.float64)
+
+    @property
+    def num_failed(self) -> int:
+        """Episodes that ended in a failure, such as a fall."""
+        return sum(1 for episode in self.episodes if episode["termination"])
+
+    @property
+    def first_failed(self) -> bool:
+        """Whether the episode of the trace is one of them."""
+        return bool(self.episodes and self.episodes[0]["termination"])
 
 
-def make_policy(spec: PolicySpec, env: Any) -> Any:
+def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = None) -> Any:
     """The policy of a specification for an environment.
+
+    Args:
+        spec: The specification.
+        env: The environment.
+        options: Options instead of its own.
 
     Raises:
         ConfigurationError: The name is neither a baseline nor an importable function.
     """
+    options = spec.options if options is None else options
     if ":" not in spec.name:
-        return baselines.make(spec.name, env, **spec.options)
+        return baselines.make(spec.name, env, **options)
     module, _, attribute = spec.name.partition(":")
     try:
         function = getattr(importlib.import_module(module), attribute)
@@ -121,7 +167,7 @@ def make_policy(spec: PolicySpec, env: Any) -> Any:
             f"policy {spec.name!r}: {error}; give a baseline ({', '.join(baselines.policy_names())}) or "
             '"module:function", a function that takes the environment and returns an object with predict()'
         ) from None
-    return function(env, **spec.options)
+    return function(env, **options)
 
 
 def make_vector_env(condition: Condition, num_envs: int, num_threads: int = 0) -> Any:
@@ -130,17 +176,13 @@ def make_vector_env(condition: Condition, num_envs: int, num_threads: int = 0) -
     Raises:
         ConfigurationError: Unknown environment, scenario, reference or argument.
     """
-    if condition.env not in ENVIRONMENTS:
-        raise unknown_name("environment", condition.env, ENVIRONMENTS)
     return gymnasium.make_vec(
-        ENVIRONMENTS[condition.env],
+        condition.environment.id,
         num_envs=num_envs,
         vectorization_mode="vector_entry_point",
         num_threads=num_threads,
         autoreset_mode=AutoresetMode.NEXT_STEP,
-        reference=condition.reference,
-        scenario=condition.scenario,
-        **condition.env_options,
+        **condition.arguments,
     )
 
 
@@ -171,19 +213,19 @@ def _play(
 ) -> None:
     """One batch of worlds, each until the end of its first episode."""
     env = make_vector_env(condition, worlds, num_threads)
-    policy = make_policy(condition.policy, env)
+    policy = make_policy(condition.policy, env, condition.policy_options)
     task = env.unwrapped.task
-    keeper = _FirstWorld(task) if first == 0 else None
-    estimates = _EstimateError(worlds) if hasattr(policy, "link_estimate") else None
+    keeper = _FirstWorld(task, condition.environment.traced) if first == 0 else None
+    estimates = _Estimates(task, worlds) if hasattr(policy, "link_estimate") else None
     observation, info = env.reset(seed=condition.seed + first)
     records: list[dict[str, Any] | None] = [None] * worlds
-    state, episode_start, unreported = None, np.ones(worlds, dtype=np.bool_), 0
+    state, episode_start, step, reported = None, np.ones(worlds, dtype=np.bool_), 0, 0
     while any(record is None for record in records):
         if keeper is not None and records[0] is None:
             keeper.take(observation, info)
         action, state = policy.predict(observation, state=state, episode_start=episode_start, deterministic=True)
         if estimates is not None:
-            estimates.take(policy.link_estimate(observation, state), env.unwrapped.truth().q, task.scored())
+            estimates.take(step, policy.link_estimate(observation, state), observation, env.unwrapped.truth())
         observation, _, terminated, truncated, info = env.step(action)
         episode_start = np.zeros(worlds, dtype=np.bool_)
         for world in np.flatnonzero(terminated | truncated):
@@ -191,64 +233,76 @@ def _play(
                 records[world] = _record(condition, first + int(world), info, int(world), estimates)
                 if world == 0 and keeper is not None:
                     keeper.take(observation, info)
-        unreported += 1
-        if progress is not None and unreported == 250:
-            progress(unreported)
-            unreported = 0
+        step += 1
+        if progress is not None and step - reported == 250:
+            progress(step - reported)
+            reported = step
     if progress is not None:
-        progress(unreported)
+        progress(task.num_steps - reported)
     result.episodes.extend(record for record in records if record is not None)
     if keeper is not None:
         result.trace, result.points, result.rest_references = keeper.trace(), keeper.points(), keeper.references
 
 
 def _record(
-    condition: Condition, episode: int, info: dict[str, Any], world: int, estimates: "_EstimateError | None"
+    condition: Condition, episode: int, info: dict[str, Any], world: int, estimates: "_Estimates | None"
 ) -> dict[str, Any]:
     metrics = {name: values[world].item() for name, values in info["episode_metrics"].items()}
-    if estimates is not None:
-        metrics["link_estimate_error_rms_rad"] = estimates.rms(world)
     return {
         "policy": condition.policy.title,
         "scenario": condition.scenario,
         "reference": condition.reference_name,
+        **condition.environment.abscissa(condition.reference),
+        **condition.swept,
         "seed": condition.seed + episode,
         "termination": str(info["termination"][world]),
         **metrics,
+        **(estimates.metrics(world) if estimates is not None else {}),
     }
 
 
-class _EstimateError:
-    """RMS of a policy's estimate of the link angle against the truth, over the scored steps."""
+class _Estimates:
+    """A policy's estimate of the link angles against the truth, and on a walker what it makes of the local frame."""
 
-    def __init__(self, worlds: int) -> None:
+    def __init__(self, task: Any, worlds: int) -> None:
+        self._task = task
         self._sum, self._count = np.zeros(worlds), np.zeros(worlds)
+        self._changes = SupportChanges(task.assumed_model) if isinstance(task.assumed_model, WalkerModel) else None
 
-    def take(self, estimate: Array, truth: Array, scored: Array) -> None:
-        self._sum += np.where(scored, np.square(estimate - truth).mean(axis=1), 0.0)
+    def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
+        scored = self._task.scored()
+        self._sum += np.where(scored, np.square(estimate - truth.q).mean(axis=1), 0.0)
         self._count += scored
+        if self._changes is not None:
+            self._changes.take(step, estimate, observation, truth)
 
-    def rms(self, world: int) -> float:
-        return float(np.sqrt(self._sum[world] / self._count[world])) if self._count[world] else float("nan")
+    def metrics(self, world: int) -> dict[str, float]:
+        """RMS over the scored steps, and the figures of the support changes."""
+        count = self._count[world]
+        rms = float(np.sqrt(self._sum[world] / count)) if count else float("nan")
+        changes = self._changes.metrics(world) if self._changes is not None else {}
+        return {"link_estimate_error_rms_rad": rms, **changes}
 
 
 class _FirstWorld:
     """Time series and static points of the first world."""
 
-    def __init__(self, task: Any) -> None:
-        self._encoder = task.observation_table.names.index("encoder_angle")
-        reference = task.config.reference
-        self.references, directions = reference.visits if hasattr(reference, "visits") else (np.zeros(0), None)
+    def __init__(self, task: Any, traced: tuple[str, ...]) -> None:
+        self._traced = traced
+        self._encoder = task.observation_table.group("encoder_angle")
+        visits = getattr(getattr(task.config, "reference", None), "visits", None)
+        self.references, directions = visits if visits is not None else (np.zeros(0), None)
         self._recorder = HoldRecorder(directions) if directions is not None else None
         self._rows: list[tuple[float, ...]] = []
 
     def take(self, observation: Array, info: dict[str, Any]) -> None:
-        self._rows.append(tuple(float(info[name][0]) for name in TRACED))
+        self._rows.append(tuple(float(info[name][0]) for name in self._traced))
         if self._recorder is not None:
-            self._recorder.take(observation[:1, self._encoder], info["link_angle_imu"][:1], int(info["rest"][0]))
+            encoder = observation[:1, self._encoder][:, 0]
+            self._recorder.take(encoder, info["link_angle_imu"][:1], int(info["rest"][0]))
 
     def trace(self) -> dict[str, Array]:
-        return dict(zip(TRACED, np.array(self._rows).T, strict=True))
+        return dict(zip(self._traced, np.array(self._rows).T, strict=True))
 
     def points(self) -> StaticPoints | None:
         return self._recorder.points()[0] if self._recorder is not None and self._recorder.is_complete else None

@@ -18,6 +18,7 @@ from elastic_env.config import Model, quantity
 from elastic_env.robots.testbed import Pendulum
 from train import plots
 from train.runs import run_folder
+from train.testbed_plots import draw_identification
 
 
 class IdentifyConfig(Model):
@@ -64,7 +65,7 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
         models = [env.unwrapped.assumed_model for env in envs]
         files = [
             folder / "identification.json",
-            plots.draw_identification(results[0], points[0], models, folder / "identification.png"),
+            draw_identification(results[0], points[0], models, folder / "identification.png"),
         ]
         console.print(result_table(results[0]))
         if config.repeats > 1:

@@ -1,6 +1,7 @@
 """Watch a policy: a window, or a video file."""
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 
 from elastic_env.errors import ElasticError, ResultsExistError, missing_extra
-from train.evaluate import ENVIRONMENTS, Condition, make_policy
+from train.evaluate import Condition, make_policy
 
 _FRAMES_PER_S = 25
 
@@ -31,24 +32,23 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     if max_s is not None and not max_s > 0.0:
         raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
     env: Any = gymnasium.make(
-        ENVIRONMENTS[condition.env], render_mode="human" if video is None else "rgb_array",
-        reference=condition.reference, scenario=condition.scenario, **condition.env_options,
+        condition.environment.id, render_mode="human" if video is None else "rgb_array", **condition.arguments
     )  # fmt: skip
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     steps = task.num_steps if max_s is None else min(task.num_steps, round(max_s / period))
-    policy = make_policy(condition.policy, env)
+    episode = _episode(env, make_policy(condition.policy, env), condition.seed, steps, console)
     try:
         if video is None:
-            _window(env, policy, condition.seed, steps, period)
+            _window(episode, period)
         else:
-            _film(env, policy, condition.seed, steps, period, video, console)
+            _film(env, episode, steps, period, video, console)
     finally:
         env.close()
 
 
-def _episode(env: Any, policy: Any, seed: int, steps: int) -> Any:
-    """Play step by step; yields the number of each step."""
+def _episode(env: Any, policy: Any, seed: int, steps: int, console: Console) -> Iterator[int]:
+    """Play step by step; yields the number of each step, and says so where the episode fails."""
     observation, _ = env.reset(seed=seed)
     state, start = None, np.array(True)
     for step in range(steps):
@@ -57,18 +57,19 @@ def _episode(env: Any, policy: Any, seed: int, steps: int) -> Any:
         start = np.array(False)
         yield step
         if terminated:
-            raise ElasticError(f"the episode ended after {step + 1} control steps: {info['termination']}")
+            console.print(f"the episode ended after {info['time_s']:.2f} s: {info['termination']}")
+            return
         if truncated:
             return
 
 
-def _window(env: Any, policy: Any, seed: int, steps: int, period: float) -> None:
+def _window(episode: Iterator[int], period: float) -> None:
     begin = time.perf_counter()
-    for step in _episode(env, policy, seed, steps):
+    for step in episode:
         time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
 
 
-def _film(env: Any, policy: Any, seed: int, steps: int, period: float, video: Path, console: Console) -> None:
+def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console) -> None:
     if video.exists():
         raise ResultsExistError(f"{video} exists and is not overwritten; name another file")
     if video.suffix not in {".mp4", ".gif"}:
@@ -83,7 +84,7 @@ def _film(env: Any, policy: Any, seed: int, steps: int, period: float, video: Pa
     frame_s = every * period
     timing: dict[str, Any] = {"duration": 1e3 * frame_s} if video.suffix == ".gif" else {"fps": 1.0 / frame_s}
     with imageio.get_writer(video, **timing) as writer:
-        for step in track(_episode(env, policy, seed, steps), "filming", total=steps, console=console, transient=True):
+        for step in track(episode, "filming", total=steps, console=console, transient=True):
             if step % every == 0:
                 writer.append_data(env.render())
     console.print(f"wrote {video}")

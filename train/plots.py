@@ -1,4 +1,4 @@
-"""Figures. Angles are drawn in mrad; every function writes one file and returns its path."""
+"""What all figures share: style, colours, files; and the bar chart of a whole comparison."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,24 +6,29 @@ from typing import Any
 
 import numpy as np
 
-from baselines.gravity_torque import make_gravity
-from baselines.identification import Identification
-from baselines.static_points import StaticPoints, link_torque
 from elastic_env.errors import missing_extra
-from elastic_env.robots.robot_model import RobotModel
+from train.environments import Column
 from train.evaluate import Evaluation
 
-_MRAD = 1e3
+MRAD, MM = 1e3, 1e3
+"""Factors from rad and m to what figures show."""
+
 _COLOURS = {
+    "zero": "#9c6644",
+    "rigid": "#555555",
+    "uncompensated_open": "#e6a57e",
     "uncompensated": "#c8553d",
-    "zero": "#c8553d",
+    "input_open": "#8fbbd9",
     "input": "#2a6f97",
-    "dynamic": "#588157",
-    "oracle": "#6d597a",
+    "input_output": "#14a098",
+    "input_wrench": "#1f2a55",
+    "dynamic": "#7aa344",
+    "oracle": "#8e5ea2",
 }
-_OTHERS = ("#bc8034", "#3d8b8b", "#8d5524", "#555555")
-_PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
-"""Fig. 6 of the paper."""
+FAILED = "#111111"
+"""Colour of the mark of a failure that belongs to no policy alone."""
+_OTHERS = ("#bc8034", "#3d8b8b", "#8d5524", "#d1495b", "#4a4e69")
+_DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 
 def require_matplotlib() -> Any:
@@ -46,6 +51,7 @@ def require_matplotlib() -> Any:
             "axes.spines.top": False,
             "axes.spines.right": False,
             "axes.grid": True,
+            "axes.axisbelow": True,
             "grid.alpha": 0.25,
             "legend.frameon": False,
             "axes.titlesize": 11,
@@ -61,156 +67,77 @@ def colour(policy: str, index: int = 0) -> str:
     return _COLOURS.get(policy, _OTHERS[index % len(_OTHERS)])
 
 
-def draw_identification(result: Identification, points: StaticPoints, models: Sequence[RobotModel], path: Path) -> Path:
-    """Deflection against gravity torque with the fitted lines, as Fig. 5 of the paper, and the residuals."""
-    plt = require_matplotlib()
-    torque = link_torque(points, [make_gravity(model) for model in models], result.link_angles(points))
-    deflection = points.theta - points.q
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(3, 1.2))
-    line = np.linspace(torque.min() - 3.0, torque.max() + 3.0, 400)
-    for direction, marker, face, label in (
-        (1, "^", "#2a6f97", "approached from below"),
-        (-1, "v", "none", "approached from above"),
-    ):
-        chosen = points.direction == direction
-        style = {"marker": marker, "s": 34, "facecolors": face, "edgecolors": "#2a6f97", "linewidths": 1.2}
-        top.scatter(torque[chosen], _MRAD * deflection[chosen], label=label, zorder=3, **style)
-        fitted = _fitted(result, line, direction)
-        top.plot(line, _MRAD * fitted, color="#2a6f97", lw=0.9, ls="-" if direction > 0 else "--")
-        residual = deflection[chosen] - _fitted(result, torque[chosen], direction)
-        if result.imu_sine_error_rad is not None:
-            residual = residual + result.imu_sine_error_rad * np.sin(points.q[chosen])
-        bottom.scatter(torque[chosen], _MRAD * residual, zorder=3, **style)
-    plain = line / result.line_stiffness_nm_per_rad + np.mean(deflection - torque / result.line_stiffness_nm_per_rad)
-    top.plot(
-        line,
-        _MRAD * plain,
-        color="#888888",
-        lw=1.0,
-        ls=":",
-        label=f"plain line, K = {result.line_stiffness_nm_per_rad:.1f}",
-    )
-    top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}")
-    top.text(
-        0.03, 0.95,
-        f"friction {result.friction_nm:.2f} N·m\ndead band {_MRAD * result.dead_band_rad:.2f} mrad\n"
-        f"offset {_MRAD * result.offset_rad:+.2f} mrad\nPearson r {result.pearson_r:.4f}",
-        transform=top.transAxes, va="top", fontsize=9,
-    )  # fmt: skip
-    top.set_ylabel("deflection θ − q [mrad]")
-    top.legend(loc="lower right")
-    bottom.axhline(0.0, color="#888888", lw=0.8)
-    bottom.set_ylabel("residual [mrad]")
-    bottom.set_xlabel("gravity torque at the link angle [N·m]")
-    return _save(plt, figure, path)
+def line_style(policy: str) -> str:
+    """Line of a policy: dashed where no center of mass is fed back."""
+    return "--" if policy in _DASHED else "-"
 
 
-def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, path: Path) -> Path:
-    """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
-    plt = require_matplotlib()
-    figure, axis = plt.subplots(figsize=(7.6, 4.4))
-    gravity = [make_gravity(model)]
-    for index, evaluation in enumerate(evaluations):
-        policy, points = evaluation.condition.policy.title, evaluation.points
-        if points is None:
-            continue
-        error = _MRAD * static_errors(evaluation)
-        marker, face = "xosDv^"[index % 6], None if index == 0 else "none"
-        style = {"facecolors": face, "edgecolors": colour(policy, index)} if face else {"color": colour(policy, index)}
-        low, high = error.min(), error.max()
-        axis.scatter(
-            link_torque(points, gravity, points.q), error, marker=marker, s=34, linewidths=1.3, zorder=3,
-            label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}", **style,
-        )  # fmt: skip
-        axis.axhspan(low, high, color=colour(policy, index), alpha=0.08, lw=0)
-        for bound in _PAPER_RANGES_MRAD.get(policy, ()):
-            axis.axhline(bound, color=colour(policy, index), lw=0.9, ls=":")
-    axis.set_title(f"Link error at rest, scenario {evaluations[0].condition.scenario}")
-    axis.set_xlabel("gravity torque at the link angle [N·m]")
-    axis.set_ylabel("q_ref − q by the link's IMU [mrad]")
-    axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=9)
-    return _save(plt, figure, path)
+def save(figure: Any, path: Path) -> Path:
+    """Write a figure and forget it."""
+    figure.savefig(path, bbox_inches="tight")
+    require_matplotlib().close(figure)
+    return path
 
 
-def static_errors(evaluation: Evaluation) -> np.ndarray:
-    """Link error by the IMU, averaged over each window at rest of the first episode, (visits,) [rad]."""
-    points = evaluation.points
-    assert points is not None
-    references = evaluation.rest_references
-    return references - points.q
+def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
+    """A metric of every policy in every scenario, one panel per reference.
 
-
-def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Reference and link error over time, one line per policy."""
-    plt = require_matplotlib()
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(8.0, 5.0), sharex=True, height_ratios=(1, 2))
-    first = evaluations[0]
-    top.plot(first.trace["time_s"], first.trace["reference_angle"], color="#333333", lw=1.2)
-    top.set_ylabel("q_ref [rad]")
-    top.set_title(f"{first.condition.reference_name}, scenario {first.condition.scenario}")
-    for index, evaluation in enumerate(evaluations):
-        policy = evaluation.condition.policy.title
-        bottom.plot(
-            evaluation.trace["time_s"], _MRAD * evaluation.trace["link_error"], lw=1.1,
-            color=colour(policy, index), label=policy,
-        )  # fmt: skip
-    bottom.axhline(0.0, color="#888888", lw=0.8)
-    bottom.set_ylabel("link error q_ref − q [mrad]")
-    bottom.set_xlabel("time [s]")
-    bottom.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2))
-    return _save(plt, figure, path)
-
-
-def draw_overview(evaluations: Sequence[Evaluation], metric: str, path: Path) -> Path:
-    """A metric of every policy in every scenario, one panel per reference; dots are episodes, bars their median."""
+    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that failed.
+    """
     plt = require_matplotlib()
     references = list(dict.fromkeys(e.condition.reference_name for e in evaluations))
     scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
     policies = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
+    panel = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * len(scenarios))
+    stacked = panel * len(references) > _WIDEST
+    rows, columns = (len(references), 1) if stacked else (1, len(references))
     figure, axes = plt.subplots(
-        1, len(references), figsize=(1.6 + max(3.0, 0.75 * len(scenarios) + 1.2) * len(references), 3.8),
-        sharey=True, squeeze=False,
+        rows, columns, figsize=(min(panel, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
+        sharey=True, sharex=stacked, squeeze=False, layout="constrained",
     )  # fmt: skip
-    width = 0.8 / len(policies)
-    for axis, reference in zip(axes[0], references, strict=True):
-        for evaluation in (e for e in evaluations if e.condition.reference_name == reference):
-            policy = evaluation.condition.policy.title
-            index = policies.index(policy)
-            x = scenarios.index(evaluation.condition.scenario) + (index - (len(policies) - 1) / 2) * width
-            values = _MRAD * evaluation.values(metric)
-            axis.bar(x, np.median(values), width=0.9 * width, color=colour(policy, index), alpha=0.85, label=policy)
-            if len(values) > 1:
-                axis.scatter(np.full(len(values), x), values, s=5, color="#222222", alpha=0.5, zorder=3)
-        axis.set_title(reference)
-        axis.set_xticks(range(len(scenarios)), scenarios, rotation=25, ha="right")
-        axis.grid(axis="x", visible=False)
-    axes[0][0].set_ylabel(f"{metric.removesuffix('_rad').replace('_', ' ')} [mrad]")
-    handles = {
-        label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        handles.values(), handles.keys(), ncols=len(policies), loc="lower center", bbox_to_anchor=(0.5, -0.14)
-    )
-    return _save(plt, figure, path)
+    for axis, reference in zip(axes.flat, references, strict=True):
+        of_reference = [e for e in evaluations if e.condition.reference_name == reference]
+        _draw_bars(axis, of_reference, column, scenarios, policies)
+        axis.set_title(evaluations[0].condition.environment.title(reference))
+        if axis.get_subplotspec().is_first_col():
+            axis.set_ylabel(column.label)
+    _legend(figure, axes.flat[0], evaluations, policies, per_row=max(int(columns * panel / 1.7), 2))
+    return save(figure, path)
 
 
-def _fitted(result: Identification, torque: np.ndarray, direction: int) -> np.ndarray:
-    load = torque + direction * result.friction_nm
-    return load / result.stiffness_nm_per_rad + np.sign(load) * result.dead_band_rad / 2.0 + result.offset_rad
+_WIDEST = 12.0
 
 
-def _interval(result: Identification) -> str:
-    return f"{result.stiffness_low_nm_per_rad:.1f} to {result.stiffness_high_nm_per_rad:.1f}"
+def _draw_bars(
+    axis: Any, evaluations: Sequence[Evaluation], column: Column, scenarios: Sequence[str], policies: Sequence[str]
+) -> None:
+    """One group of bars per scenario."""
+    width = 0.84 / len(policies)
+    for evaluation in evaluations:
+        policy = evaluation.condition.policy.title
+        index = policies.index(policy)
+        x = scenarios.index(evaluation.condition.scenario) + (index - (len(policies) - 1) / 2) * width
+        values = column.scale * evaluation.values(column.metric)
+        shade = colour(policy, index)
+        axis.bar(x, np.median(values) if len(values) else 0.0, width=0.9 * width, color=shade)
+        if len(evaluation.episodes) > 1:
+            axis.scatter(np.full(len(values), x), values, s=4, color="#222222", alpha=0.45, lw=0, zorder=3)
+        if evaluation.num_failed:
+            shown = {
+                "color": shade if len(values) == 0 else FAILED,
+                "zorder": 4,
+                "transform": axis.get_xaxis_transform(),
+            }
+            axis.scatter(x, 0.035, marker="X", s=26, edgecolors="white", lw=0.5, **shown)
+    slanted = {"rotation": 25, "ha": "right"} if len(scenarios) > 2 else {}
+    axis.set_xticks(range(len(scenarios)), scenarios, **slanted)
+    axis.grid(axis="x", visible=False)
 
 
-def _paper(policy: str) -> str:
-    if policy not in _PAPER_RANGES_MRAD:
-        return ""
-    low, high = _PAPER_RANGES_MRAD[policy]
-    return f" (paper, dotted: {low:+.1f} to {high:+.1f})"
-
-
-def _save(plt: Any, figure: Any, path: Path) -> Path:
-    figure.savefig(path, bbox_inches="tight")
-    plt.close(figure)
-    return path
+def _legend(figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int) -> None:
+    """Policies, and the mark of failures if there are any."""
+    handles = [axis.bar(np.nan, 0.0, color=colour(policy, i), label=policy) for i, policy in enumerate(policies)]
+    if any(evaluation.num_failed for evaluation in evaluations):
+        failure = evaluations[0].condition.environment.failure
+        handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
+    figure.legend(handles=handles, ncols=min(len(handles), per_row), loc="outside lower center")

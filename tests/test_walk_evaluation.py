@@ -1,0 +1,444 @@
+"""Evaluating a walk: the error of the local frame against Eq. 1, records, tables, figures, sweeps, and the commands."""
+
+import json
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from rich.console import Console
+
+import train.compare
+import train.speed
+from baselines.walking_controller import LocalFrame, local_frame
+from elastic_env.config import load_yaml
+from elastic_env.robots.robot_model import WalkerModel
+from elastic_env.signals import Array
+from elastic_env.walking.gait import LEFT, RIGHT
+from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+from train.cli import main
+from train.compare import CompareConfig, try_out
+from train.evaluate import Condition, Evaluation, PolicySpec, evaluate, make_vector_env
+from train.figures import figure_name, option_curves, reference_curves
+from train.summary import print_summary, summary_table, write_summary
+from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
+from train.sweep_plots import draw_sweep
+from train.walk_plots import draw_pelvis, draw_zmp, intervals
+
+SHORT = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
+TWO_STEPS = {"step_period": [0.3, 0.5, 0.3], "num_steps": 2}
+COMMAND_SHORT = "{step_period: [0.3, 0.5, 0.3], num_steps: 1}"
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+HIP_ROLL = 1
+"""Place of the hip roll joint in a leg of six."""
+
+
+def walk(policy: str = "zero", reference: Any = None, **values: Any) -> Condition:
+    """A short cell of the walker."""
+    spec = values.pop("spec", PolicySpec(name=policy))
+    return Condition(env="walker", policy=spec, reference=reference or SHORT, **values)
+
+
+def made_up(condition: Condition, *episodes: tuple[str, float]) -> Evaluation:
+    """An evaluation whose metrics all have one value, with the termination of every episode."""
+    names = [column.metric for column in condition.environment.columns]
+    names += [column.metric for _, columns in condition.environment.splits for column in columns]
+    return Evaluation(condition, [{"termination": end, **dict.fromkeys(names, value)} for end, value in episodes])
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test works in a folder of its own, on a wide terminal without colours."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Conditions are evaluated in this process: starting others takes seconds."""
+
+    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+        return [evaluate(condition, num_threads=1) for condition in conditions]
+
+    monkeypatch.setattr(train.compare, "run_conditions", run)
+
+
+@pytest.fixture(scope="module")
+def model() -> WalkerModel:
+    """The assumed walker with a plan of two steps."""
+    return make_vector_env(walk(reference=TWO_STEPS), 1).unwrapped.assumed_model
+
+
+@pytest.fixture(scope="module")
+def fallen() -> Evaluation:
+    """A walk without any control, which ends in a fall."""
+    return evaluate(walk("zero", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1)
+
+
+# The local frame at the support changes.
+
+
+@pytest.mark.parametrize("foot", [LEFT, RIGHT])
+@pytest.mark.parametrize("theta", [0.05, -0.02])
+def test_frame_error_of_a_hip_roll_deflection_is_equation_1(model: WalkerModel, foot: int, theta: float) -> None:
+    """Catches a wrong sign, foot or axes: the pelvis rolls by θ over an upright leg, and no encoder shows it."""
+    biped = model.biped
+    seen, true = np.zeros((1, 12)), np.zeros((1, 12))
+    true[0, 6 * foot + HIP_ROLL] = -theta
+    attitude = np.array([[theta, 0.0]])
+    e = frame_error(local_frame(biped, seen, attitude), local_frame(biped, true, attitude), foot)
+    L, half = biped.leg.reach + biped.ankle_height, theta / 2.0
+    expected = L * np.array([0.0, 2.0 * np.sin(half) * np.cos(half), 2.0 * np.sin(half) ** 2])
+    np.testing.assert_allclose(e, [expected], rtol=0.0, atol=1e-12)
+    assert np.linalg.norm(expected) == pytest.approx(2.0 * L * abs(np.sin(half)), rel=1e-12)
+
+
+def test_com_jumps_by_what_the_distance_of_the_feet_is_wrong(model: WalkerModel) -> None:
+    """Catches a jump of the true center of mass, and one that depends on where the pelvis is."""
+    footholds = model.biped.footholds
+    soles = np.pad(footholds, ((0, 0), (0, 1)), constant_values=-0.7)
+    wrong = np.array([0.003, -0.002, 0.001])
+    com = np.array([[0.01, 0.02, 0.1]])
+    assert not com_jump(LocalFrame(com, soles[None]), footholds, LEFT, RIGHT).any()
+    soles[RIGHT] += wrong
+    frame = LocalFrame(com, soles[None])
+    np.testing.assert_allclose(com_jump(frame, footholds, LEFT, RIGHT), [-wrong], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(com_jump(frame, footholds, RIGHT, LEFT), [wrong], rtol=0.0, atol=1e-15)
+
+
+def test_support_changes_are_those_between_the_steps(model: WalkerModel) -> None:
+    """Catches the beginning and the end of the walk taken for a change, and one that is a step late."""
+    timing = model.plan.timing
+    (change,) = support_changes(timing)
+    assert timing.time[change - 1] == pytest.approx(1.0 + 1.1)  # standing, and the first step
+    assert (timing.support[change - 1], timing.support[change]) == (LEFT, RIGHT)
+
+
+def test_tilt_leaves_the_heading_out() -> None:
+    """Catches an error of the frame that is the pelvis' heading, which no policy can know."""
+    roll, pitch, yaw = 0.03, -0.02, 0.4
+    heading = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    R = heading @ rotation_y(np.array([pitch]))[0] @ rotation_x(np.array([roll]))[0]
+    np.testing.assert_allclose(tilt(R[None]), [[roll, pitch]], atol=1e-15)
+
+
+def test_figures_of_the_support_changes_are_taken_at_the_changes_alone(model: WalkerModel) -> None:
+    """Catches samples of other steps, worlds mixed up, and a mean that is the largest."""
+    theta, change = np.array([0.01, 0.03]), int(support_changes(model.plan.timing)[0])
+    observation = np.zeros((2, len(model.observation_table)))
+    observation[:, model.observation_table.group("imu_attitude")] = np.stack([theta, np.zeros(2)], axis=-1)
+    true = np.zeros((2, 12))
+    true[:, 6 * RIGHT + HIP_ROLL] = -theta
+    truth = SimpleNamespace(q=true, pelvis_R=rotation_x(theta))
+    changes = SupportChanges(model)
+    assert changes.metrics(0) == {}
+    for step, estimate in ((change - 1, true + 0.1), (change, np.zeros((2, 12))), (change + 1, true + 0.1)):
+        changes.take(step, estimate, observation, truth)
+    L = model.biped.leg.reach + model.biped.ankle_height
+    for world in (0, 1):
+        metrics = changes.metrics(world)
+        length = 2.0 * L * np.sin(theta[world] / 2.0)
+        assert metrics["frame_error_mean_m"] == pytest.approx(length, rel=1e-9)
+        assert metrics["frame_error_max_m"] == pytest.approx(length, rel=1e-9)
+        assert metrics["frame_error_y_mean_m"] == pytest.approx(L * np.sin(theta[world]), rel=1e-9)
+
+
+# Records.
+
+
+def test_a_rigid_robot_knows_its_frame_and_an_elastic_one_does_not() -> None:
+    """Catches an error that is there without elasticity, options of a policy that do not reach the environment."""
+    rigid = PolicySpec(name="zero", label="rigid", env_options={"form": "rigid"})
+    cells = [walk(spec=rigid, reference=TWO_STEPS, scenario="ideal"), walk("input", TWO_STEPS, scenario="ideal")]
+    stiff, elastic = (evaluate(cell, num_threads=1).episodes[0] for cell in cells)
+    assert stiff["policy"] == "rigid"
+    assert max(stiff[f"frame_error_{part}_m"] for part in ("mean", "max", "y_mean")) < 1e-9
+    assert stiff["link_estimate_error_rms_rad"] < 1e-12
+    assert 1e-3 < elastic["frame_error_mean_m"] < 0.05
+    assert elastic["frame_error_mean_m"] == elastic["frame_error_max_m"]  # one change
+    assert elastic["link_estimate_error_rms_rad"] > 1e-3
+
+
+def test_record_of_a_walk_names_its_cell_and_agrees_with_its_trace() -> None:
+    """Catches metrics of another world, a reference without its number, and signals out of step with their time."""
+    cell = walk("input_output", episodes=2, seed=3)
+    result = evaluate(cell, num_threads=1)
+    record, trace = result.episodes[0], result.trace
+    named = {"reference": "0.3+0.5+0.3 s", "step_period_s": 1.1, "scenario": "nominal", "seed": 3, "termination": ""}
+    assert {key: record[key] for key in named} == named
+    scored = (trace["time_s"] > 1.0 + 1e-9) & (trace["time_s"] < 2.1 + 1e-9)
+    assert record["pelvis_roll_rms_rad"] == pytest.approx(np.sqrt(np.mean(trace["pelvis_roll"][scored] ** 2)), rel=1e-9)
+    task = make_vector_env(cell, 1).unwrapped.task
+    assert {metric.name for metric in task.metrics} <= record.keys()
+    assert "frame_error_mean_m" not in record  # one step, no change of the support foot
+    assert record["link_estimate_error_rms_rad"] > 0.0
+
+
+class Blind:
+    """A policy that commands nothing and estimates nothing."""
+
+    def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+        """No offset."""
+        return np.zeros((len(observation), 12)), state
+
+
+def blind(env: Any) -> Blind:
+    """One's own policy, as "module:function"."""
+    return Blind()
+
+
+def test_a_policy_without_estimate_has_no_error_of_it() -> None:
+    """Catches a protocol that asks for more than `predict`."""
+    record = evaluate(walk(f"{__name__}:blind", TWO_STEPS, scenario="ideal"), num_threads=1).episodes[0]
+    assert [name for name in record if name.startswith(("frame", "com_jump", "link_estimate"))] == []
+    assert record["pelvis_roll_rms_rad"] > 0.0
+
+
+def test_a_fall_is_counted_and_not_scored(fallen: Evaluation) -> None:
+    """Catches the scores of half a walk beside those of whole ones."""
+    assert fallen.episodes[0]["termination"] == "fell"
+    assert fallen.num_failed == 1
+    assert len(fallen.values("pelvis_roll_rms_rad")) == 0
+    assert fallen.trace["time_s"][-1] == pytest.approx(fallen.episodes[0]["duration_s"])
+    assert fallen.trace["time_s"][-1] < 4.5
+    table = Console(width=160, record=True, file=StringIO())
+    table.print(summary_table([fallen]))
+    row = next(line for line in table.export_text().splitlines() if "zero" in line)
+    assert row.split()[-1] == "1/1"
+    assert not any(character.isdigit() for character in row.split("zero")[1].replace("1/1", ""))
+
+
+# Tables.
+
+
+def test_tables_say_median_worst_and_falls() -> None:
+    """Catches a fall averaged in, a worst episode that fell, and phases that are left out."""
+    cell = made_up(walk("input", episodes=4), ("", 0.002), ("fell", 9.0), ("", 0.004), ("", 0.003))
+    text = write_summary([cell], Path("summary.md")).read_text()
+    first, second = (line for line in text.splitlines() if line.startswith("| 0.3+0.5+0.3 s | nominal | input |"))
+    assert first.count("3.00 (4.00)") == 4  # roll and pitch
+    assert second.count("(4.00)") == 9  # roll, pitch and ZMP in three phases
+    assert first.endswith("| 1/4 |")
+    assert second.endswith("| 1/4 |")
+    assert "9000" not in text
+    for word in ("pelvis", "double", "single", "transition", "e mean [mm]", "COM jump [mm]", "early [ms]"):
+        assert word.lower() in text.lower()
+
+
+@pytest.mark.parametrize("width", [100, 72])
+def test_the_table_fits_its_terminal(width: int) -> None:
+    """Catches names cut short and numbers broken over lines; where there is no room, columns go and are named."""
+    cells = [
+        made_up(walk(policy, [0.8, 0.6, 0.8], scenario="ideal+soft"), ("", 0.0876))
+        for policy in ("uncompensated", "input_output")
+    ]
+    console = Console(width=width, record=True, file=StringIO())
+    print_summary(cells, console)
+    lines = console.export_text().splitlines()
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    row = next(line for line in lines if "uncompensated" in line).split()
+    assert row[:4] == ["0.8+0.6+0.8", "s", "ideal+soft", "uncompensated"]
+    assert set(row[4:-1]) <= {"87.60", "87.6", "88"}
+    assert any("summary.md" in line for line in lines) == (width < 100)
+
+
+# Figures.
+
+
+def test_figures_of_walks_and_falls_are_drawn(fallen: Evaluation) -> None:
+    """Catches empty pictures, and a fall that breaks the scale or the drawing."""
+    upright = evaluate(walk("input_output", {"step_period": 3, "num_steps": 1}, scenario="ideal"), num_threads=1)
+    for draw in (draw_pelvis, draw_zmp):
+        with Image.open(draw([fallen, upright], Path(f"{draw.__name__}.png"))) as image:
+            pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
+        for colour in (
+            (0x9C, 0x66, 0x44),
+            (0x14, 0xA0, 0x98),
+            (0xE9, 0xEB, 0xEE),
+        ):  # zero, input_output, single support
+            assert (np.abs(pixels - colour).sum(axis=1) == 0).sum() > 20
+
+
+def test_intervals_are_where_a_mask_is_true() -> None:
+    """Catches a shade that is a sample short, or missing at the ends."""
+    mask, time = np.array([1.0, 0.0, 1.0, 1.0, 0.0, 1.0]), 0.1 * np.arange(6)
+    assert intervals(mask, time) == [(0.0, 0.0), (pytest.approx(0.2), pytest.approx(0.3)), (0.5, 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "reference", "scenario", "name"),
+    [
+        ("pelvis", {"step_period": 24, "num_steps": 2}, "nominal", "fig7_pelvis_24_s_nominal"),
+        ("pelvis", 3, "ideal", "fig8_pelvis_3_s_ideal"),
+        ("zmp", 24, "nominal", "fig9_zmp_24_s_nominal"),
+        ("zmp", 3.0, "nominal", "fig10_zmp_3_s_nominal"),
+        ("zmp", 3, "soft", "zmp_3_s_soft"),
+        ("pelvis", [0.8, 0.6, 0.8], "nominal", "pelvis_0.8+0.6+0.8_s_nominal"),
+    ],
+)
+def test_figures_have_the_numbers_of_the_paper(kind: str, reference: Any, scenario: str, name: str) -> None:
+    """Catches a picture that claims to be the paper's and is not."""
+    assert figure_name(kind, Evaluation(walk(reference=reference, scenario=scenario))) == name
+
+
+def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
+    """Catches values in the order of the configuration, a level that is a curve, and falls averaged in."""
+    config = CompareConfig(
+        name="s", env="walker", sweep={"option": "stiffness_scale", "values": [2.0, 0.5, 1.0]},
+        policies=[{"name": "input"}, {"name": "oracle", "level": True}],
+    )  # fmt: skip
+    cells = config.conditions()
+    assert [cell.policy_options for cell in cells] == [{"stiffness_scale": x} for x in (2.0, 0.5, 1.0)] + [{}]
+    ends = [[("", 0.03)], [("fell", 9.0)], [("", 0.01), ("fell", 9.0)], [("", 0.002)]]
+    input_curve, level = option_curves([made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)])
+    np.testing.assert_array_equal(input_curve.x, [0.5, 1.0, 2.0])
+    np.testing.assert_array_equal(input_curve.failed_share, [1.0, 0.5, 0.0])
+    np.testing.assert_allclose(input_curve.median(cells[0].environment.overview), [np.nan, 10.0, 30.0])
+    assert level.is_level
+    assert not input_curve.is_level
+    with Image.open(draw_sweep([input_curve, level], "assumed over true stiffness", Path("s.png"))) as image:
+        assert len(np.unique(np.asarray(image.convert("L")))) > 20
+
+
+def test_references_are_swept_by_their_step_period() -> None:
+    """Catches a list of durations that has no place on the axis."""
+    references = [3, [0.8, 0.6, 0.8], {"step_period": 24, "num_steps": 2}]
+    (curve,) = reference_curves([made_up(walk(reference=reference), ("", 0.01)) for reference in references])
+    np.testing.assert_allclose(curve.x, [2.2, 3.0, 24.0])
+
+
+# Configurations and commands.
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_configurations_that_come_with_it_are_valid(path: Path) -> None:
+    """Catches a name or a duration that does not exist: all policies in the first cell, all cells of the first."""
+    config = load_yaml(path, CompareConfig)
+    cells = config.conditions()
+    assert config.name == path.stem
+    first = cells[0]
+    key = [(str(cell.reference), cell.scenario, cell.policy.title) for cell in cells]
+    own = key[0]
+    try_out([cell for cell, k in zip(cells, key, strict=True) if k[:2] == own[:2] or k[1:] == own[1:]])
+    try_out([first.replace(scenario=scenario) for scenario in config.scenarios])
+
+
+def test_cells_of_a_scenario_have_their_own_number_of_episodes() -> None:
+    """Catches five episodes of the same, where nothing is random."""
+    config = CompareConfig(
+        name="c", env="walker", scenarios=["ideal", "soft"], episodes=5, scenario_episodes={"ideal": 1}
+    )
+    assert {cell.scenario: cell.episodes for cell in config.conditions()} == {"ideal": 1, "soft": 5}
+    assert {cell.reference for cell in config.conditions()} == {3}
+
+
+def test_what_a_reference_says_goes_before_the_options_of_all() -> None:
+    """Catches the number of steps of one motion that reaches all the others."""
+    cell = walk(reference={"step_period": 24, "num_steps": 2}, env_options={"num_steps": 4, "stiffness": 900})
+    assert cell.arguments == {"scenario": "nominal", "step_period": 24, "num_steps": 2, "stiffness": 900}
+    assert walk(reference=3, env_options={"num_steps": 4}).arguments["num_steps"] == 4
+
+
+@pytest.mark.usefixtures("in_process")
+def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches files that are lost or not named, and figures with policies that they should not show."""
+    drawn: list[list[str]] = []
+    for name in ("pelvis", "zmp"):
+        draw = train.figures._FIGURES[name]
+
+        def record(evaluations: Sequence[Evaluation], path: Path, draw: Any = draw) -> Path:
+            drawn.append([e.condition.policy.title for e in evaluations])
+            return draw(evaluations, path)
+
+        monkeypatch.setitem(train.figures._FIGURES, name, record)
+    content = {
+        "name": "walks", "env": "walker", "references": [SHORT], "scenarios": ["ideal"],
+        "policies": ["zero", "input", {"name": "zero", "label": "rigid", "env_options": {"form": "rigid"}}],
+        "figure_policies": ["input", "rigid"],
+    }  # fmt: skip
+    Path("walks.yaml").write_text(yaml.safe_dump(content))
+    main(["compare", "walks.yaml"])
+    assert drawn == [["input", "rigid"]] * 2
+    stem = "0.3+0.5+0.3_s_ideal.png"
+    files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"}
+    folder = Path("runs/walks")
+    assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json"}
+    printed = capsys.readouterr().out
+    assert [name for name in files if f"runs/walks/{name}" not in printed] == []
+    assert load_yaml(folder / "config.yaml", CompareConfig) == load_yaml("walks.yaml", CompareConfig)
+    assert "0/1" in next(line for line in printed.splitlines() if "rigid" in line)
+
+
+@pytest.mark.usefixtures("in_process")
+def test_evaluate_walks(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a command that knows the testbed alone."""
+    main(["evaluate", "--env", "walker", "--reference", COMMAND_SHORT, "--policy", "input_wrench"])
+    assert Path("runs/evaluate/pelvis_0.3+0.5+0.3_s_nominal.png").exists()
+    assert "input_wrench" in capsys.readouterr().out
+
+
+def test_play_films_a_walk() -> None:
+    """Catches a film of the testbed alone."""
+    main(["play", "--env", "walker", "--reference", COMMAND_SHORT, "--video", "x.gif", "--max-s", "0.1"])
+    with Image.open("x.gif") as film:
+        assert film.info["duration"] == 40
+
+
+def test_play_of_a_fall_keeps_the_film(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a film that is lost where it becomes worth seeing."""
+    arguments = ["--env", "walker", "--policy", f"{__name__}:leaning", "--reference", COMMAND_SHORT]
+    main(["play", *arguments, "--video", "x.gif"])
+    with Image.open("x.gif") as film:
+        assert film.n_frames >= 2
+    printed = capsys.readouterr().out
+    assert "fell" in printed
+    assert "wrote x.gif" in printed
+
+
+class Leaning(Blind):
+    """A policy that falls at once."""
+
+    def predict(self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True):
+        """As far as the command goes, in every joint."""
+        return np.full(12, 0.3), state
+
+
+def leaning(env: Any) -> Leaning:
+    """One's own policy, as "module:function"."""
+    return Leaning()
+
+
+def test_speed_of_the_walker_with_a_policy(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a measurement of the testbed under the walker's name."""
+    main(["speed", "--env", "walker", "--policy", "input_wrench", "--num-envs", "2", "--steps", "3", "--rounds", "1"])
+    (result,) = json.loads(Path("runs/speed/speed.json").read_text())
+    assert (result["env"], result["policy"], result["num_envs"]) == ("walker", "input_wrench", 2)
+    assert result["ratio"] > 0.0
+    assert "walker with input_wrench" in capsys.readouterr().out
+
+
+def test_raw_stepping_walks_as_the_environment_does() -> None:
+    """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
+    env = make_vector_env(walk(), 3, num_threads=1)
+    env.reset(seed=0)
+    inside = env.unwrapped
+    raw = train.speed._RawWorlds(inside.task, inside.simulation, threads=2)
+    controls = np.empty((300, *inside.simulation.ctrl.shape))
+    for step in range(300):
+        env.step(np.full((3, 12), 0.01, dtype=np.float32))
+        controls[step] = inside.simulation.ctrl
+    raw.run(controls)
+    data, kind = mujoco.MjData(inside.task.model), int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    for state, qpos, qvel in zip(raw._states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
+        mujoco.mj_setState(inside.task.model, data, state, kind)
+        np.testing.assert_array_equal(data.qpos, qpos)
+        np.testing.assert_array_equal(data.qvel, qvel)

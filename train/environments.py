@@ -1,0 +1,210 @@
+"""What the commands know of each environment: how it is made, what of it is kept, and how its figures are shown."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from elastic_env.errors import ConfigurationError, unknown_name
+
+Reference: TypeAlias = str | float | list[float] | dict[str, Any]
+"""The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
+
+RESERVED = ("scenario", "num_envs", "num_threads", "autoreset_mode", "render_mode")
+"""Arguments of the environments that have keys of their own, or no place in a comparison."""
+
+_UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric in tables and charts.
+
+    Attributes:
+        title: Words for it, short.
+        metric: Name in the record of an episode; its end is the unit.
+        on_console: Whether it is shown where there is little room.
+        decimals: How many are shown.
+    """
+
+    title: str
+    metric: str
+    on_console: bool = True
+    decimals: int = 2
+
+    @property
+    def unit(self) -> str:
+        """Unit in which it is shown."""
+        return self._shown[0]
+
+    @property
+    def scale(self) -> float:
+        """Factor from SI to the shown unit."""
+        return self._shown[1]
+
+    @property
+    def label(self) -> str:
+        """Title with unit."""
+        return f"{self.title} [{self.unit}]"
+
+    @property
+    def _shown(self) -> tuple[str, float]:
+        return next(shown for suffix, shown in _UNITS.items() if self.metric.endswith(suffix))
+
+
+@dataclass(frozen=True)
+class Environment:
+    """An environment as the commands see it.
+
+    Attributes:
+        id: Its name for `gymnasium.make`.
+        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
+        default_reference: Reference where none is named.
+        arguments: Arguments of `gymnasium.make` for a reference.
+        label: How tables and figures call a reference.
+        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where there is nothing.
+        traced: Signals of the first episode that are kept.
+        columns: The summary table.
+        splits: Further tables of the summary, title and columns.
+        note: What the reader of the summary table has to know.
+        figures: Names of the time series to draw, see `train.figures`.
+        overview: Column of the bar chart.
+        swept: Columns drawn against a swept value.
+        quantity: What a reference is, in titles; empty where its label says it.
+        failure: What an episode is called that ends before its time.
+    """
+
+    id: str
+    motion: str
+    default_reference: Reference
+    arguments: Callable[[Reference], dict[str, Any]]
+    label: Callable[[Reference], str]
+    abscissa: Callable[[Reference], dict[str, float]]
+    traced: tuple[str, ...]
+    columns: tuple[Column, ...]
+    note: str
+    figures: tuple[str, ...]
+    overview: Column
+    swept: tuple[Column, ...]
+    splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
+    quantity: str = ""
+    failure: str = "failed"
+
+    def title(self, reference_name: str) -> str:
+        """A reference's name as it stands in titles."""
+        return f"{self.quantity} {reference_name}".strip()
+
+
+def environment(name: str) -> Environment:
+    """The environment of a short name.
+
+    Raises:
+        ConfigurationError: It does not exist.
+    """
+    if name not in ENVIRONMENTS:
+        raise unknown_name("environment", name, ENVIRONMENTS)
+    return ENVIRONMENTS[name]
+
+
+def _kind(reference: Reference) -> str:
+    return str(reference.get("kind")) if isinstance(reference, dict) else str(reference)
+
+
+def _step_period(reference: Reference) -> Any:
+    """Step period of a walker's reference, or its durations [s]."""
+    if not isinstance(reference, dict):
+        return reference
+    if "step_period" not in reference:
+        raise ConfigurationError(
+            f"a reference of the walker that is a mapping needs the key 'step_period', got {reference!r}; "
+            "for example {step_period: 24, num_steps: 2}"
+        )
+    return reference["step_period"]
+
+
+def _walk_arguments(reference: Reference) -> dict[str, Any]:
+    return {**(reference if isinstance(reference, dict) else {}), "step_period": _step_period(reference)}
+
+
+def _walk_label(reference: Reference) -> str:
+    period = _step_period(reference)
+    parts = period if isinstance(period, list | tuple) else [period]
+    return "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts) + " s"
+
+
+def _walk_abscissa(reference: Reference) -> dict[str, float]:
+    period = _step_period(reference)
+    parts = period if isinstance(period, list | tuple) else [period]
+    return {"step_period_s": float(f"{sum(map(float, parts)):.6g}")}
+
+
+_TESTBED = Environment(
+    id="elastic_env/Testbed-v0",
+    motion="reference",
+    default_reference="hold",
+    arguments=lambda reference: {"reference": reference},
+    label=_kind,
+    abscissa=lambda _: {},
+    traced=(
+        "time_s", "reference_angle", "link_angle", "link_angle_imu", "deflection", "link_error", "link_error_imu",
+        "joint_torque",
+    ),
+    columns=(
+        Column("rms", "link_error_rms_rad"),
+        Column("peak", "link_error_peak_rad"),
+        Column("IMU-", "link_error_imu_min_rad"),
+        Column("IMU+", "link_error_imu_max_rad"),
+        Column("est.", "link_estimate_error_rms_rad"),
+    ),
+    note="Link error; IMU- and IMU+: its range by the link's IMU; est.: rms error of the estimated link angle.",
+    figures=("time", "static"),
+    overview=Column("link error rms", "link_error_rms_rad"),
+    swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
+)  # fmt: skip
+
+_ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
+
+_WALKER = Environment(
+    id="elastic_env/WalkInPlace-v0",
+    motion="step_period",
+    default_reference=3,
+    arguments=_walk_arguments,
+    label=_walk_label,
+    abscissa=_walk_abscissa,
+    traced=(
+        "time_s", "pelvis_roll", "pelvis_pitch", "zmp_x", "zmp_y", "zmp_reference_x", "zmp_reference_y",
+        "single_support", "support", "load_share", "force_left", "force_right",
+    ),
+    columns=(
+        _ROLL,
+        Column("roll peak", "pelvis_roll_peak_rad"),
+        Column("pitch rms", "pelvis_pitch_rms_rad"),
+        Column("pitch peak", "pelvis_pitch_peak_rad", on_console=False),
+        _ZMP,
+        Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
+        Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
+        Column("early", "early_touchdown_mean_s", decimals=0),
+        Column("e mean", "frame_error_mean_m", decimals=1),
+        Column("COM jump", "com_jump_mean_m", decimals=1),
+    ),
+    splits=(
+        (
+            "By phase, rms",
+            tuple(
+                Column(f"{title} {phase}", f"{metric}_{phase}_rms_{unit}")
+                for title, metric, unit in (
+                    ("roll", "pelvis_roll", "rad"), ("pitch", "pelvis_pitch", "rad"), ("ZMP", "zmp_deviation", "m"),
+                )
+                for phase in ("double", "single", "transition")
+            ),
+        ),
+    ),
+    note="Pelvis and ZMP while walking; early: swing foot down before its time; e: Eq. 1 at the support changes.",
+    figures=("pelvis", "zmp"),
+    overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
+    swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    quantity="step period",
+    failure="falls",
+)  # fmt: skip
+
+ENVIRONMENTS = {"testbed": _TESTBED, "walker": _WALKER}
+"""Environments by the short names of the command line."""

@@ -1,0 +1,134 @@
+"""Which figures a comparison draws, and what their files are called."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from train.environments import Environment
+from train.evaluate import Evaluation, make_vector_env
+from train.plots import draw_overview
+from train.sweep_plots import Curve, draw_sweep
+from train.testbed_plots import draw_static_errors, draw_time_series
+from train.walk_plots import draw_pelvis, draw_zmp
+
+Draw = Callable[[Sequence[Evaluation], Path], Path]
+
+MIN_SWEPT_REFERENCES = 3
+"""From so many references with a number of their own on, the scores are drawn against it."""
+
+_PAPER_FIGURES = {("pelvis", "24 s"): 7, ("pelvis", "3 s"): 8, ("zmp", "24 s"): 9, ("zmp", "3 s"): 10}
+_PAPER_SCENARIOS = ("ideal", "nominal")
+
+
+def draw_figures(
+    evaluations: Sequence[Evaluation], folder: Path, policies: Sequence[str] = (), swept: str | None = None
+) -> list[Path]:
+    """Draw the figures of a comparison.
+
+    Args:
+        evaluations: All cells.
+        folder: Where to.
+        policies: Policies of the time series, all if empty.
+        swept: What an axis of swept options says; None without a sweep.
+    """
+    if swept is not None:
+        groups = cells(evaluations)
+        return [draw_sweep(option_curves(group), swept, folder / f"sweep_{_stem(group[0])}.png") for group in groups]
+    known = evaluations[0].condition.environment
+    files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
+    files += _draw_reference_sweeps(evaluations, known, folder)
+    for group in cells(evaluations):
+        shown = [e for e in group if not policies or e.condition.policy.title in policies]
+        for name in known.figures:
+            files += draw_figure(name, shown, folder)
+    return files
+
+
+def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
+    """Draw a figure of one reference and scenario, if there is something to show.
+
+    Args:
+        name: Name in the environment's description.
+        evaluations: The policies.
+        folder: Where to.
+    """
+    if not evaluations or (name == "static" and evaluations[0].points is None):
+        return []
+    return [_FIGURES[name](evaluations, folder / f"{figure_name(name, evaluations[0])}.png")]
+
+
+def figure_name(name: str, evaluation: Evaluation) -> str:
+    """Name of a figure's file; the paper's conditions have the number of its figure in front."""
+    condition = evaluation.condition
+    number = _PAPER_FIGURES.get((name, condition.reference_name))
+    prefix = f"fig{number}_" if number is not None and condition.scenario in _PAPER_SCENARIOS else ""
+    return f"{prefix}{name}_{_stem(evaluation)}"
+
+
+def cells(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
+    """Evaluations of the same reference and scenario together."""
+    groups: dict[tuple[str, str], list[Evaluation]] = {}
+    for evaluation in evaluations:
+        key = evaluation.condition.reference_name, evaluation.condition.scenario
+        groups.setdefault(key, []).append(evaluation)
+    return list(groups.values())
+
+
+def option_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
+    """A curve per policy over the swept option; a policy that was not swept is a level."""
+    return [
+        Curve(title, [next(iter(e.condition.swept.values()), None) for e in own], own)
+        for title, own in _by_policy(evaluations).items()
+    ]
+
+
+def reference_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
+    """A curve per policy over the number of the references."""
+    return [Curve(title, [_number(e) for e in own], own) for title, own in _by_policy(evaluations).items()]
+
+
+def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment, folder: Path) -> list[Path]:
+    if len({_number(e) for e in evaluations} - {None}) < MIN_SWEPT_REFERENCES:
+        return []
+    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    return [
+        draw_sweep(
+            reference_curves([e for e in evaluations if e.condition.scenario == scenario]), f"{known.quantity} [s]",
+            folder / f"sweep_{_safe(scenario)}.png",
+        )
+        for scenario in scenarios
+    ]  # fmt: skip
+
+
+def _by_policy(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
+    policies: dict[str, list[Evaluation]] = {}
+    for evaluation in evaluations:
+        policies.setdefault(evaluation.condition.policy.title, []).append(evaluation)
+    return policies
+
+
+def _number(evaluation: Evaluation) -> float | None:
+    """What of a reference scores can be drawn against."""
+    condition = evaluation.condition
+    return next(iter(condition.environment.abscissa(condition.reference).values()), None)
+
+
+def _stem(evaluation: Evaluation) -> str:
+    return _safe(f"{evaluation.condition.reference_name}_{evaluation.condition.scenario}")
+
+
+def _safe(text: str) -> str:
+    return re.sub(r"[^\w.=+-]+", "_", text)
+
+
+def _draw_static(evaluations: Sequence[Evaluation], path: Path) -> Path:
+    model = make_vector_env(evaluations[0].condition, 1).unwrapped.assumed_model
+    return draw_static_errors(evaluations, model, path)
+
+
+_FIGURES: dict[str, Draw] = {
+    "time": draw_time_series,
+    "static": _draw_static,
+    "pelvis": draw_pelvis,
+    "zmp": draw_zmp,
+}
