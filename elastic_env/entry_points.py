@@ -108,7 +108,7 @@ def configure_walk(
         gait=make_gait(step_period, **steps, **(gait or {})),
         scenario=make_scenario(scenario),
         robot=chosen,
-        joints=joints,
+        joints=tuple(joints.values()),
         form=form,
     )
 

@@ -11,9 +11,9 @@ from elastic_env.errors import ElasticError
 from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.signals import Array
 
-_DAMPER_TIME_S = 0.05
-"""D/K while the robot settles [s]."""
-_REST_RATE = 5e-5
+_DAMPING = 75.0
+"""D of all springs while the robot settles [N·m·s/rad]; with more, light links make the integration unstable."""
+_REST_RATE = 1e-4
 _CHECK_EVERY_S = 0.25
 _LONGEST_S = 20.0
 
@@ -44,7 +44,7 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
         ElasticError: It does not come to rest, or falls.
     """
     calm = copy.copy(model)
-    calm.tendon_damping[:] = np.maximum(calm.tendon_damping, _DAMPER_TIME_S * calm.tendon_stiffness)
+    calm.tendon_damping[:] = np.maximum(calm.tendon_damping, _DAMPING)
     calm.dof_frictionloss[:] = 0.0
     data, at = mujoco.MjData(calm), JointAddresses.of(calm, joints)
     data.qpos[:3] = pelvis

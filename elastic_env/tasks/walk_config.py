@@ -1,16 +1,20 @@
 """Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
 
+from functools import lru_cache
 from typing import Literal
 
 import mujoco
 import numpy as np
-from pydantic import Field
 
 from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint
-from elastic_env.robots.thormang import LEG_JOINTS, Thormang, elastic_spec
+from elastic_env.robots.joint_names import spring_name
+from elastic_env.robots.standing import Equilibrium, settle
+from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped, elastic_spec
 from elastic_env.scenario import Scenario, make_scenario
+from elastic_env.signals import Array, IntArray
 from elastic_env.walking.gait import Gait
+from elastic_env.walking.walk_plan import plan_walk
 
 FALL_HEIGHT_SHARE = 0.75
 """A pelvis below this share of its planned height has fallen."""
@@ -34,8 +38,8 @@ class WalkConfig(Model):
     gait: Gait = Gait()
     scenario: Scenario = make_scenario("nominal")
     robot: Thormang = Thormang()
-    joints: dict[str, ElasticJoint] = Field(default_factory=lambda: Thormang().joints)
-    """The leg joints as they are known; the scenario says in what the true ones differ."""
+    joints: tuple[ElasticJoint, ...] = tuple(Thormang().joints.values())
+    """The leg joints in order, as they are known; the scenario says in what the true ones differ."""
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
@@ -50,7 +54,7 @@ class WalkConfig(Model):
                 coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
                 viscous_friction=joint.viscous_friction * self.scenario.friction_scale,
             )
-            for name, joint in self.joints.items()
+            for name, joint in zip(LEG_JOINTS, self.joints, strict=True)
         }
 
     @property
@@ -85,6 +89,30 @@ class RobotDraw(Model):
 
 BANK_SIZE = 64
 """Robots in the bank of a scenario that draws them."""
+
+
+@lru_cache(maxsize=512)
+def equilibrium(config: WalkConfig, draw: RobotDraw) -> Equilibrium:
+    """Where a robot of the bank stands under zero offset, found once."""
+    plan = plan_walk(config.gait, biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
+    model = config.true_model()
+    if config.form == "tendon":
+        springs = spring_ids(model)
+        model.tendon_stiffness[springs] *= np.array(draw.stiffness_factor)
+    model.body("floor").quat[:] = floor_tilt(config.scenario.slope_rad, draw.slope_direction_rad)
+    q = plan.q[0] - np.array(draw.encoder_bias_rad)
+    return settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+
+
+def spring_ids(model: mujoco.MjModel) -> IntArray:
+    """The springs of the leg joints among the tendons of an elastic model, (12,)."""
+    return np.array([model.tendon(spring_name(joint)).id for joint in LEG_JOINTS])
+
+
+def floor_tilt(angle: float, direction: float) -> Array:
+    """Quaternion of a floor that rises by an angle in a direction, both [rad], (4,)."""
+    half = angle / 2.0
+    return np.array([np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0])
 
 
 def robot_bank(scenario: Scenario) -> list[RobotDraw]:

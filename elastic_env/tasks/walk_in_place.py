@@ -25,7 +25,6 @@ then the same of the right leg (r_...); a name before a dot has one column per j
 Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in the order of the joints, within ±0.3.
 """
 
-import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,14 +32,21 @@ import numpy as np
 from elastic_env.elasticity import joint_torque
 from elastic_env.errors import ConfigurationError
 from elastic_env.metrics import Metric
-from elastic_env.robots.joint_names import JointAddresses, spring_name
+from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
-from elastic_env.robots.standing import Equilibrium, settle
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.simulation import Simulation
-from elastic_env.tasks.walk_config import FALL_HEIGHT_SHARE, FALL_TILT_RAD, WalkConfig, robot_bank
+from elastic_env.tasks.walk_config import (
+    FALL_HEIGHT_SHARE,
+    FALL_TILT_RAD,
+    WalkConfig,
+    equilibrium,
+    floor_tilt,
+    robot_bank,
+    spring_ids,
+)
 from elastic_env.tasks.walk_state import WalkMeasurement, WalkState, WalkTruth, attitude_of, rms, rotation_of
 from elastic_env.tasks.walk_tables import ACTION, FELL, METRICS, OBSERVATION
 from elastic_env.walking.gait import LEFT, RIGHT
@@ -85,12 +91,7 @@ class WalkTask:
         self._robot = robot
         self._at = JointAddresses.of(self.model, LEG_JOINTS)
         self._bank = robot_bank(config.scenario)
-        self._equilibria: dict[int, Equilibrium] = {}
-        self._springs = (
-            np.array([self.model.tendon(spring_name(joint)).id for joint in LEG_JOINTS])
-            if config.form == "tendon"
-            else None
-        )
+        self._springs = spring_ids(self.model) if config.form == "tendon" else None
         feet = [self.model.body(f"{side}_foot").id for side in SIDES]
         self._foot_mass, self._foot_com = self.model.body_mass[feet], self.model.body_ipos[feet]
         self._sites = np.array([self.model.site(f"{side}_ft").id for side in SIDES])
@@ -282,33 +283,20 @@ class WalkTask:
 
     def _place(self, simulation: Simulation, world: int) -> None:
         """Give a world its robot, at rest."""
-        scenario, number = self.config.scenario, int(self._draw[world])
-        draw = self._bank[number]
+        scenario, draw = self.config.scenario, self._bank[self._draw[world]]
         self._encoder_bias[world] = draw.encoder_bias_rad
         self._stiffness[world] = self._true_model.stiffness * np.array(draw.stiffness_factor)
         if scenario.stiffness_spread > 0.0 and self._springs is not None:
             simulation.vary("tendon_stiffness")[world, self._springs] = self._stiffness[world]
         if scenario.slope_rad > 0.0:
             floor = simulation.model.body("floor").id
-            simulation.vary("body_quat")[world, floor] = _tilt(scenario.slope_rad, draw.slope_direction_rad)
-        rest = self._equilibrium(number)
+            simulation.vary("body_quat")[world, floor] = floor_tilt(scenario.slope_rad, draw.slope_direction_rad)
+        rest = equilibrium(self.config, draw)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         simulation.qpos[world] = rest.qpos
         simulation.qvel[world] = 0.0
         simulation.act[world] = rest.act
         simulation.ctrl[world] = self.plan.q[0] - self._encoder_bias[world]
         simulation.bind("qacc_warmstart")[world] = rest.warmstart
-
-    def _equilibrium(self, number: int) -> Equilibrium:
-        """The rest state of a robot of the bank, found once."""
-        if number not in self._equilibria:
-            draw, scenario, model = self._bank[number], self.config.scenario, copy.copy(self.model)
-            if self._springs is not None:
-                model.tendon_stiffness[self._springs] *= np.array(draw.stiffness_factor)
-            if scenario.slope_rad > 0.0:
-                model.body("floor").quat[:] = _tilt(scenario.slope_rad, draw.slope_direction_rad)
-            q = self.plan.q[0] - np.array(draw.encoder_bias_rad)
-            self._equilibria[number] = settle(model, LEG_JOINTS, self.plan.pelvis[0], q, q)
-        return self._equilibria[number]
 
     def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
         """The true state of some worlds; the others keep their last one."""
@@ -379,12 +367,6 @@ def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
 
 
 _NOISE_WIDTH = 2 + 3 + 12
-
-
-def _tilt(angle: float, direction: float) -> Array:
-    """Quaternion that raises the floor in a direction."""
-    half = angle / 2.0
-    return np.array([np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0])
 
 
 def _num_substeps(config: WalkConfig) -> int:
