@@ -109,7 +109,7 @@ class BoundContactGravity:
 
 
 class WrenchTorque:
-    """Torque of a walker's joints from the measured foot wrenches and the weight of its legs.
+    """Torque of a walker's joints from the measured foot wrenches and the weight of its legs above the sensors.
 
     Args:
         model: Assumed walker.
@@ -132,8 +132,8 @@ class BoundWrenchTorque:
     """Joint torques under wrenches that are known in the frames of the feet; a `GravityModel` on (num_worlds, 12)."""
 
     def __init__(self, model: WalkerModel, wrench: Array, gravity: Array) -> None:
-        self._chains, self._wrench, self._gravity = model.biped.chains, wrench, gravity
-        self._frames = _Memo(self._chains)
+        self._wrench, self._gravity = wrench, gravity
+        self._frames = _Memo(model.biped.chains_above_feet)
 
     def gravity_torque(self, q: Array) -> Array:
         """See `GravityModel`."""

@@ -34,8 +34,17 @@ class Biped:
     @cached_property
     def chains(self) -> LegChains:
         """The legs for batches."""
+        return LegChains(self.rigid, self._legs)
+
+    @cached_property
+    def chains_above_feet(self) -> LegChains:
+        """The legs with feet that weigh nothing: what the sensors at the ankles do not carry."""
+        return LegChains(self.rigid, self._legs, feet_weigh=False)
+
+    @property
+    def _legs(self) -> list[tuple[str, ...]]:
         half = len(JOINTS)
-        return LegChains(self.rigid, [self.joint_names[:half], self.joint_names[half:]])
+        return [self.joint_names[:half], self.joint_names[half:]]
 
     @property
     def weight(self) -> float:

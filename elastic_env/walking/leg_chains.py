@@ -56,21 +56,24 @@ class LegChains:
     Args:
         model: Compiled rigid model.
         legs: Joint names of every leg, from hip to foot, equally many.
+        feet_weigh: Whether the feet have mass; not where a sensor above them weighs them already.
 
     Raises:
         ConfigurationError: A leg is no chain of single hinges about a coordinate axis, or its links are turned.
     """
 
-    def __init__(self, model: mujoco.MjModel, legs: Sequence[Sequence[str]]) -> None:
+    def __init__(self, model: mujoco.MjModel, legs: Sequence[Sequence[str]], feet_weigh: bool = True) -> None:
         joints = np.array([[model.joint(name).id for name in leg] for leg in legs])
         bodies = model.jnt_bodyid[joints]
         self._axis = np.argmax(np.abs(model.jnt_axis[joints[0]]), axis=-1)
         _require_chains(model, joints, bodies, self._axis)
         self._offset = model.body_pos[bodies]  # (L, J, 3), of each link in its parent
         self._mass = model.body_mass[bodies]
+        if not feet_weigh:
+            self._mass[:, -1] = 0.0
         self._ipos = model.body_ipos[bodies]
         self._carried = np.cumsum(self._mass[:, ::-1], axis=1)[:, ::-1]
-        self.mass = float(model.body_mass.sum())
+        self.mass = float(model.body_mass.sum() - (0.0 if feet_weigh else model.body_mass[bodies[:, -1]].sum()))
         """Mass of the whole robot [kg]."""
         self._trunk_moment = self._moment_of_the_rest(model, bodies)
 
