@@ -64,7 +64,7 @@ def tilt_penalty(pelvis_error: Array) -> Array:
 
 def zmp_penalty(zmp_deviation: Array) -> Array:
     """−|ZMP deviation| [m]; none where the feet are not loaded and there is no ZMP."""
-    return -np.nan_to_num(zmp_deviation)
+    return -np.where(np.isnan(zmp_deviation), 0.0, zmp_deviation)
 
 
 class WalkTask:

@@ -108,7 +108,7 @@ class WalkMeasurement(_Rows):
 
 def rms(values: Array) -> Array:
     """Root of the mean square over the last axis."""
-    return np.sqrt(np.mean(values * values, axis=-1))
+    return np.sqrt(np.einsum("...i,...i", values, values) / values.shape[-1])
 
 
 def rotation_of(quaternion: Array) -> Array:

@@ -46,12 +46,12 @@ class Biped:
         half = len(JOINTS)
         return [self.joint_names[:half], self.joint_names[half:]]
 
-    @property
+    @cached_property
     def weight(self) -> float:
         """Weight of the whole robot [N]."""
         return self.chains.mass * self.gravity
 
-    @property
+    @cached_property
     def gravity(self) -> float:
         """Acceleration of gravity [m/s²]."""
         return float(np.linalg.norm(self.rigid.opt.gravity))

@@ -10,7 +10,7 @@ taken about the origin on the ground, the ZMP is
 import numpy as np
 
 from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import cross
+from elastic_env.walking.leg_chains import cross, rotated
 
 
 def ground_wrench(
@@ -30,9 +30,8 @@ def ground_wrench(
         Force and moment in that frame, (..., L, 3) each [N], [N·m].
     """
     weight = foot_mass[:, None] * gravity[..., None, :]
-    lever = (foot_R * foot_com[:, None, :]).sum(axis=-1)
-    f = (foot_R * force[..., None, :]).sum(axis=-1) - weight
-    n = (foot_R * moment[..., None, :]).sum(axis=-1) - cross(lever, weight)
+    f = rotated(foot_R, force) - weight
+    n = rotated(foot_R, moment) - cross(rotated(foot_R, foot_com), weight)
     return f, n
 
 
@@ -48,9 +47,14 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
     Returns:
         (..., 2) [m]; nan where the feet are not loaded.
     """
-    about_origin = (cross(ankle, force) + moment).sum(axis=-2)
-    vertical = force[..., 2].sum(axis=-1)
+    about_origin = _over_feet(cross(ankle, force) + moment)
+    vertical = _over_feet(force)[..., 2]
     loaded = vertical >= least_n
     scale = np.where(loaded, vertical, 1.0)
     zmp = np.stack([-about_origin[..., 1], about_origin[..., 0]], axis=-1) / scale[..., None]
     return np.where(loaded[..., None], zmp, np.nan)
+
+
+def _over_feet(vectors: Array) -> Array:
+    """Sum over the two feet, (..., 2, 3) to (..., 3)."""
+    return vectors[..., 0, :] + vectors[..., 1, :]

@@ -67,7 +67,12 @@ class LegChains:
         bodies = model.jnt_bodyid[joints]
         self._axis = np.argmax(np.abs(model.jnt_axis[joints[0]]), axis=-1)
         _require_chains(model, joints, bodies, self._axis)
-        self._offset = model.body_pos[bodies]  # (L, J, 3), of each link in its parent
+        offset = model.body_pos[bodies]  # (L, J, 3), of each link in its parent
+        self._displacements = [
+            [(component, offset[:, j, component]) for component in range(3) if offset[:, j, component].any()]
+            for j in range(offset.shape[1])
+        ]
+        """Components of each link's offset that are not zero, with their values on every leg."""
         self._mass = model.body_mass[bodies]
         if not feet_weigh:
             self._mass[:, -1] = 0.0
@@ -80,7 +85,8 @@ class LegChains:
     def frames(self, q: Array) -> LegFrames:
         """Forward kinematics of all legs, (..., L, J) [rad]."""
         shape, J = q.shape[:-1], q.shape[-1]
-        sine, cosine = np.moveaxis(np.sin(q), -1, 0), np.moveaxis(np.cos(q), -1, 0)
+        angles = q.transpose(-1, *range(q.ndim - 1)).copy()
+        sine, cosine = np.sin(angles), np.cos(angles)
         # joints and components come first in memory, so that every operation runs over whole batches
         axes, anchors = np.empty((2, J, 3, *shape))
         columns = np.zeros((3, 3, *shape))  # of the orientation of the last link
@@ -88,7 +94,8 @@ class LegChains:
         links = np.empty((J, 3, 3, *shape))
         anchor = np.zeros((3, *shape))
         for j in range(J):
-            anchor = _displaced(anchor, columns, self._offset[:, j])
+            for component, offset in self._displacements[j]:
+                anchor = anchor + columns[component] * offset
             axis = self._axis[j]
             first, second = _OTHERS[axis]
             axes[j], anchors[j], turned = columns[axis], anchor, links[j]
@@ -96,16 +103,18 @@ class LegChains:
             turned[first] = cosine[j] * columns[first] + sine[j] * columns[second]
             turned[second] = cosine[j] * columns[second] - sine[j] * columns[first]
             columns = turned
-        ipos = self._ipos.T.reshape(3, J, *[1] * (len(shape)), -1)
+        per_leg = (*[1] * len(shape), -1)  # against (..., L) of a joint and component
+        ipos = self._ipos.T.reshape(3, J, *per_leg)
         coms = anchors + links[:, 0] * ipos[0] + links[:, 1] * ipos[1] + links[:, 2] * ipos[2]
-        mass, below = (x.T.reshape(J, *[1] * len(shape), -1) for x in (self._mass, self._carried))
+        mass, below = self._mass.T.reshape(J, *per_leg), self._carried.T.reshape(J, *per_leg)
         carried = np.cumsum((mass * coms)[::-1], axis=0)[::-1]
-        com = (self._trunk_moment + np.moveaxis(carried[0], 0, -1).sum(axis=-2)) / self.mass
+        legs = carried[0].sum(axis=-1)
+        com = (self._trunk_moment + legs.transpose(*range(1, legs.ndim), 0)) / self.mass
         return LegFrames(
             axes=_vectors_last(axes),
             anchors=_vectors_last(anchors),
             levers=_vectors_last(carried - below * anchors),
-            foot_R=np.moveaxis(columns, (0, 1), (-1, -2)),
+            foot_R=columns.transpose(*range(2, columns.ndim), 1, 0),
             com=com,
         )
 
@@ -180,15 +189,7 @@ def _upper(size: int, diagonal: int) -> Array:
 
 def _vectors_last(array: Array) -> Array:
     """A view with joints and components last, (J, 3, ..., L) to (..., L, J, 3)."""
-    return np.moveaxis(array, (0, 1), (-2, -1))
-
-
-def _displaced(origin: Array, columns: Array, offset: Array) -> Array:
-    """A point of each leg's link, (3, ..., L), from its offset in the link, (L, 3)."""
-    for column, component in zip(columns, offset.T, strict=True):
-        if component.any():
-            origin = origin + column * component
-    return origin
+    return array.transpose(*range(2, array.ndim), 0, 1)
 
 
 def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:
