@@ -154,16 +154,20 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
     Returns:
         (T, 2) [m]; under the support foot in single support, halfway between the feet before and after the walk.
     """
-    middle = feet.mean(axis=0)
-    inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
-    towards = middle - feet
-    supports = feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    middle, supports = feet.mean(axis=0), support_points(gait, feet)
     zmp = np.repeat(middle[None], len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, supports, middle):
         progress = (timing.time - begin) / duration
         blend = quintic(progress)[0] if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
         zmp += blend[:, None] * (target - start)
     return zmp
+
+
+def support_points(gait: Gait, feet: Array) -> Array:
+    """Where the ZMP is while a foot alone carries the robot, under or inward of its ankle, (2, 2) [m]."""
+    inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
+    towards = feet.mean(axis=0) - feet
+    return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
 def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, float, Array, Array]]:

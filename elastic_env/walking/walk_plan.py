@@ -15,7 +15,7 @@ from elastic_env.rigid_body import FloatingBody
 from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import contact_points, load_share, shares
-from elastic_env.walking.gait import RIGHT, Gait, Timing, step_timing, zmp_reference
+from elastic_env.walking.gait import RIGHT, Gait, Timing, step_timing, support_points, zmp_reference
 from elastic_env.walking.leg_chains import cross
 from elastic_env.walking.preview_control import PreviewConfig, follow_zmp
 
@@ -92,7 +92,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     q = _angles(biped, pelvis, ankles, timing.time)
     dynamics = _dynamics(biped, pelvis, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
-    share = load_share(zmp, biped.footholds)
+    share = load_share(zmp, support_points(gait, biped.footholds))
     torque = _joint_torque(biped, pelvis, q, dynamics, share)
     return WalkPlan(
         gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height,
