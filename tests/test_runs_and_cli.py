@@ -607,6 +607,7 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch.setattr(train.demo, "_STATIC", train.demo._STATIC.replace(references=[HOLD]))
     monkeypatch.setattr(train.demo, "_MOTION", train.demo._MOTION.replace(references=[SINE]))
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
+    monkeypatch.setattr(train.demo, "_SLOW_WALK", train.demo._SLOW_WALK.replace(references=[short_walk]))
     monkeypatch.setattr(train.demo, "_WALK", train.demo._WALK.replace(references=[short_walk]))
     main(["demo"])
     printed = capsys.readouterr().out
@@ -649,6 +650,9 @@ def test_interrupting_a_comparison_ends_its_workers_at_once(tmp_path: Path) -> N
     output, _ = process.communicate(timeout=20)
     assert process.returncode == 130, output
     assert "Traceback" not in output
+    deadline = time.monotonic() + 10.0
+    while _members(process.pid) and time.monotonic() < deadline:  # Python's own resource tracker leaves last
+        time.sleep(0.1)
     assert _members(process.pid) == []
     assert not (tmp_path / "runs" / "long").exists()
 

@@ -53,22 +53,26 @@ class Identify:
 class Evaluate:
     """Play episodes of one policy under one scenario and print its metrics.
 
-    Examples: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
-    elastic evaluate --env walker --policy input_wrench --reference 3
+    Example, one joint: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
+
+    Example, a walk: elastic evaluate --env walker --policy input_wrench --reference 3
     """
 
     policy: str = "input"
-    """Baseline, or "module:function" for one's own. Baselines: zero, uncompensated, input, dynamic, oracle; on the
-    walker also uncompensated_open, input_open, input_output, input_wrench."""
+    """Baseline, or "module:function" for one's own. Baselines are
+    zero, uncompensated, input, dynamic, oracle; on the walker also
+    uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
     """Environment: testbed (one joint) or walker (a humanoid that walks in place)."""
     scenario: str = "nominal"
-    """Scenario, such as nominal, ideal, soft, stiff, payload, backlash, sensor, ideal+soft; on the walker also spread,
-    push, slope."""
+    """Scenario, such as nominal, ideal, soft, stiff, payload, backlash,
+    sensor, ideal+soft; on the walker also spread, push, slope."""
     reference: str | None = None
-    """Motion. Testbed: hold (default), sine, multisine, steps, or a mapping such as '{kind: sine, amplitude: 0.3}'.
-    Walker: step period 24, 3 (default), 1.6 or 1.1 [s], or durations [s] of double, single and double support such as
-    '[0.8, 0.6, 0.8]', or a mapping such as '{step_period: 3, num_steps: 2}'."""
+    """Motion. Testbed: hold (default), sine, multisine, steps,
+    or a mapping such as '{kind: sine, amplitude: 0.3}'.
+    Walker: step period 24, 3 (default), 1.6 or 1.1 [s],
+    or its durations of double, single, double support '[0.8, 0.6, 0.8]',
+    or a mapping such as '{step_period: 3, num_steps: 2}'."""
     episodes: int = 1
     """Number of episodes, seeds following --seed."""
     seed: int = 0
@@ -96,7 +100,11 @@ class Compare:
     """Compare policies × scenarios × references × seeds as a configuration says.
 
     Writes episodes.csv (one row per episode), summary.md and figures beside the resolved configuration, seed, versions
-    and commit. Examples: elastic compare configs/testbed.yaml; elastic compare configs/paper.yaml (the paper's walks)
+    and commit.
+
+    Example, one joint: elastic compare configs/testbed.yaml
+
+    Example, the paper's walks: elastic compare configs/paper.yaml
     """
 
     config: Annotated[Path, tyro.conf.Positional]
@@ -148,8 +156,10 @@ class Play:
     """Watch one episode: in a window in real time, or with --video as a file.
 
     Deviations from the reference are drawn enlarged, by a factor that the picture shows.
-    Examples: elastic play --policy input --reference sine --video sine.mp4
-    elastic play --env walker --policy input_output --video walk.mp4
+
+    Example, one joint: elastic play --policy input --reference sine --video sine.mp4
+
+    Example, a walk: elastic play --env walker --policy input_output --video walk.mp4
     """
 
     policy: str = "uncompensated"
@@ -159,7 +169,7 @@ class Play:
     scenario: str = "nominal"
     """Scenario."""
     reference: str | None = None
-    """Motion, as in elastic evaluate; default sine on the testbed, step period 3 on the walker."""
+    """Motion, as in elastic evaluate; default sine, on the walker 3."""
     seed: int = 0
     """Seed of the episode."""
     video: Path | None = None

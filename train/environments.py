@@ -65,7 +65,8 @@ class Environment:
         traced: Signals of the first episode that are kept.
         columns: The summary table.
         splits: Further tables of the summary, title and columns.
-        note: What the reader of the summary table has to know.
+        subject: What the summary table is about.
+        note: What its reader has to know.
         figures: Names of the time series to draw, see `train.figures`.
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
@@ -81,6 +82,7 @@ class Environment:
     abscissa: Callable[[Reference], dict[str, float]]
     traced: tuple[str, ...]
     columns: tuple[Column, ...]
+    subject: str
     note: str
     figures: tuple[str, ...]
     overview: Column
@@ -155,7 +157,8 @@ _TESTBED = Environment(
         Column("IMU+", "link_error_imu_max_rad"),
         Column("est.", "link_estimate_error_rms_rad"),
     ),
-    note="Link error; IMU- and IMU+: its range by the link's IMU; est.: rms error of the estimated link angle.",
+    subject="link error",
+    note="IMU- and IMU+: range by the link's IMU; est.: rms error of the estimated link angle.",
     figures=("time", "static"),
     overview=Column("link error rms", "link_error_rms_rad"),
     swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
@@ -198,7 +201,8 @@ _WALKER = Environment(
             ),
         ),
     ),
-    note="Pelvis and ZMP while walking; early: swing foot down before its time; e: Eq. 1 at the support changes.",
+    subject="pelvis and ZMP of the walk",
+    note="Early: swing foot down before its time; e: Eq. 1 at the support changes.",
     figures=("pelvis", "zmp"),
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),

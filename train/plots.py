@@ -72,6 +72,12 @@ def line_style(policy: str) -> str:
     return "--" if policy in _DASHED else "-"
 
 
+def columns_of(entries: int, widest: int = 5) -> int:
+    """Columns of a legend, so that its rows are about equally full."""
+    rows = -(-entries // widest)
+    return -(-entries // max(rows, 1))
+
+
 def save(figure: Any, path: Path) -> Path:
     """Write a figure and forget it."""
     figure.savefig(path, bbox_inches="tight")
@@ -80,43 +86,52 @@ def save(figure: Any, path: Path) -> Path:
 
 
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
-    """A metric of every policy in every scenario, one panel per reference.
+    """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel with all references.
 
     Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that failed.
     """
     plt = require_matplotlib()
-    references = list(dict.fromkeys(e.condition.reference_name for e in evaluations))
-    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    known = evaluations[0].condition.environment
     policies = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    panel = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * len(scenarios))
-    stacked = panel * len(references) > _WIDEST
-    rows, columns = (len(references), 1) if stacked else (1, len(references))
+    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    panels: dict[str, dict[str, list[Evaluation]]] = {}
+    for evaluation in evaluations:
+        reference, scenario = evaluation.condition.reference_name, evaluation.condition.scenario
+        outer, inner = (
+            (f"scenario {scenario}", reference) if len(scenarios) == 1 else (known.title(reference), scenario)
+        )
+        panels.setdefault(outer, {}).setdefault(inner, []).append(evaluation)
+    width = 1.2 + max(3.0, (0.35 + 0.14 * len(policies)) * max(map(len, panels.values())))
+    stacked = len(panels) > 1 and width * len(panels) > _WIDEST
+    rows, columns = (len(panels), 1) if stacked else (1, len(panels))
     figure, axes = plt.subplots(
-        rows, columns, figsize=(min(panel, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
+        rows, columns, figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
         sharey=True, sharex=stacked, squeeze=False, layout="constrained",
     )  # fmt: skip
-    for axis, reference in zip(axes.flat, references, strict=True):
-        of_reference = [e for e in evaluations if e.condition.reference_name == reference]
-        _draw_bars(axis, of_reference, column, scenarios, policies)
-        axis.set_title(evaluations[0].condition.environment.title(reference))
+    for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
+        _draw_bars(axis, groups, column, policies)
+        axis.set_title(title)
         if axis.get_subplotspec().is_first_col():
             axis.set_ylabel(column.label)
-    _legend(figure, axes.flat[0], evaluations, policies, per_row=max(int(columns * panel / 1.7), 2))
+    if len(scenarios) == 1 and known.quantity:
+        axes[-1][0].set_xlabel(known.quantity)
+    _legend(figure, axes.flat[0], evaluations, policies, per_row=max(int(columns * width / 1.7), 2))
     return save(figure, path)
 
 
 _WIDEST = 12.0
+"""Width beyond which panels stand one above the other [in]."""
+_ROOMY = 7
+"""From so many bars in a group on, the name of the group has room below it."""
 
 
-def _draw_bars(
-    axis: Any, evaluations: Sequence[Evaluation], column: Column, scenarios: Sequence[str], policies: Sequence[str]
-) -> None:
-    """One group of bars per scenario."""
+def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]) -> None:
+    """A bar per policy in every group."""
     width = 0.84 / len(policies)
-    for evaluation in evaluations:
+    for place, evaluation in ((place, e) for place, group in enumerate(groups.values()) for e in group):
         policy = evaluation.condition.policy.title
         index = policies.index(policy)
-        x = scenarios.index(evaluation.condition.scenario) + (index - (len(policies) - 1) / 2) * width
+        x = place + (index - (len(policies) - 1) / 2) * width
         values = column.scale * evaluation.values(column.metric)
         shade = colour(policy, index)
         axis.bar(x, np.median(values) if len(values) else 0.0, width=0.9 * width, color=shade)
@@ -129,8 +144,10 @@ def _draw_bars(
                 "transform": axis.get_xaxis_transform(),
             }
             axis.scatter(x, 0.035, marker="X", s=26, edgecolors="white", lw=0.5, **shown)
-    slanted = {"rotation": 25, "ha": "right"} if len(scenarios) > 2 else {}
-    axis.set_xticks(range(len(scenarios)), scenarios, **slanted)
+    crowded = len(groups) > 2 and len(policies) < _ROOMY
+    slanted = {"rotation": 25, "ha": "right"} if crowded else {}
+    axis.set_xticks(range(len(groups)), list(groups), **slanted)
+    axis.set_xlim(-0.55, len(groups) - 0.45)
     axis.grid(axis="x", visible=False)
 
 
@@ -140,4 +157,4 @@ def _legend(figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies:
     if any(evaluation.num_failed for evaluation in evaluations):
         failure = evaluations[0].condition.environment.failure
         handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))
-    figure.legend(handles=handles, ncols=min(len(handles), per_row), loc="outside lower center")
+    figure.legend(handles=handles, ncols=columns_of(len(handles), per_row), loc="outside lower center")

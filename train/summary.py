@@ -40,7 +40,8 @@ def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column] |
     """
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console] if columns is None else columns
-    table = Table(title="median over episodes", caption=escape(known.note), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    title = f"{known.subject}, median over episodes"
+    table = Table(title=title, caption=escape(known.note), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     swept = _swept(evaluations)
     for name in ("reference", "scenario", "policy"):
         table.add_column(name, no_wrap=True, vertical="bottom")
@@ -98,7 +99,8 @@ def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
     known = evaluations[0].condition.environment
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
     statistic = "Median over the episodes that did not fail" + (" (the worst of them in brackets)" if several else "")
-    parts = [f"{statistic}; {known.failure} are counted beside.", known.note, _markdown(evaluations, known.columns)]
+    head = f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; {known.failure} are counted beside."
+    parts = [head, known.note, _markdown(evaluations, known.columns)]
     for title, columns in known.splits:
         parts += [f"{title}:", _markdown(evaluations, columns)]
     path.write_text("\n\n".join(parts) + "\n")

@@ -10,7 +10,7 @@ import numpy as np
 from elastic_env.signals import Array
 from train.environments import Column
 from train.evaluate import Evaluation
-from train.plots import colour, line_style, require_matplotlib, save
+from train.plots import colour, columns_of, line_style, require_matplotlib, save
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def draw_sweep(curves: Sequence[Curve], label: str, path: Path) -> Path:
     panels[-1].set_xlabel(label)
     handles, labels = panels[-1].get_legend_handles_labels()
     figure.align_ylabels(panels)
-    figure.legend(handles, labels, ncols=4, loc="outside lower center")
+    figure.legend(handles, labels, ncols=columns_of(len(labels)), loc="outside lower center")
     return save(figure, path)
 
 

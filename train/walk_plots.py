@@ -11,14 +11,14 @@ import numpy as np
 
 from elastic_env.signals import Array
 from train.evaluate import Evaluation
-from train.plots import FAILED, MM, MRAD, colour, line_style, require_matplotlib, save
+from train.plots import FAILED, MM, MRAD, colour, columns_of, line_style, require_matplotlib, save
 
 _SHADE = "#e9ebee"
 _BEFORE_FALL_S = 0.6
 """What happens in this time before a fall does not set the scale [s]."""
 _PAPER_BOUND_MRAD = 10.0
 """What the pelvis error stays below with compensation in the paper, in its two gaits."""
-_PAPER_LABEL = "paper, compensated: within 10 mrad"
+_PAPER_LABEL = "paper, compensated: ±10 mrad"
 _PAPER_GAITS = ("24 s", "3 s")
 
 
@@ -27,10 +27,12 @@ def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
     figure, axes = _panels(evaluations, "Pelvis error")
     for axis, signal, name in zip(axes, ("pelvis_roll", "pelvis_pitch"), ("roll", "pitch"), strict=True):
         axis.axhline(0.0, color="#777777", lw=0.8)
+        _draw_lines(axis, evaluations, signal, MRAD)
         if evaluations[0].condition.reference_name in _PAPER_GAITS:
             for bound in (-_PAPER_BOUND_MRAD, _PAPER_BOUND_MRAD):
                 axis.axhline(bound, color="#777777", lw=0.9, ls=":", label=_PAPER_LABEL)
-        _draw_lines(axis, evaluations, signal, MRAD)
+            low, high = axis.get_ylim()
+            axis.set_ylim(min(low, -1.2 * _PAPER_BOUND_MRAD), max(high, 1.2 * _PAPER_BOUND_MRAD))
         axis.set_ylabel(f"{name} [mrad]")
     return _finish(figure, axes, evaluations, path)
 
@@ -110,5 +112,5 @@ def _finish(figure: Any, axes: Any, evaluations: Sequence[Evaluation], path: Pat
     once = {label: handle for handle, label in zip(*axes[0].get_legend_handles_labels(), strict=True)}
     policies = [e.condition.policy.title for e in evaluations]
     labels = [*policies, *(label for label in once if label not in policies)]
-    figure.legend([once[label] for label in labels], labels, ncols=4, loc="outside lower center")
+    figure.legend([once[label] for label in labels], labels, ncols=columns_of(len(labels)), loc="outside lower center")
     return save(figure, path)
