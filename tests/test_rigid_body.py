@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from elastic_env.errors import ConfigurationError
-from elastic_env.rigid_body import RigidBody
+from elastic_env.rigid_body import FloatingBody, RigidBody
 from elastic_env.robots.testbed import JOINT, Pendulum, rigid_spec
 from elastic_env.signals import Array
 
@@ -13,13 +13,22 @@ PENDULUM = Pendulum()
 BODIES = 6
 
 
-def random_tree(seed: int) -> mujoco.MjModel:
-    """A fixed-base tree with one to three hinges a body, anchors off the origin, references, tilted inertias."""
+def random_tree(seed: int, floating: bool = False) -> mujoco.MjModel:
+    """A tree with one to three hinges a body, anchors off the origin, references, tilted inertias.
+
+    Args:
+        seed: Of its lengths, masses and axes.
+        floating: A base with a mass and a free joint, and hinges without references.
+    """
     generator = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.gravity = generator.uniform(-5.0, 5.0, 3) - [0.0, 0.0, 8.0]
     bodies = [spec.worldbody.add_body(name="base", pos=generator.uniform(-1, 1, 3), quat=generator.normal(size=4))]
+    if floating:
+        bodies[0].add_freejoint(name="free")
+        bodies[0].mass, bodies[0].ipos, bodies[0].iquat = 4.0, [0.1, -0.2, 0.3], generator.normal(size=4)
+        bodies[0].inertia, bodies[0].explicitinertial = [0.4, 0.3, 0.5], True
     for b in range(BODIES):
         parent = bodies[generator.integers(len(bodies))]
         principal = generator.uniform(0.02, 0.03, 3)
@@ -31,7 +40,7 @@ def random_tree(seed: int) -> mujoco.MjModel:
         for j in range(generator.integers(1, 4)):
             body.add_joint(
                 name=f"hinge{b}_{j}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=generator.normal(size=3),
-                pos=generator.uniform(-0.1, 0.1, 3), ref=generator.uniform(-1.0, 1.0),
+                pos=generator.uniform(-0.1, 0.1, 3), ref=0.0 if floating else generator.uniform(-1.0, 1.0),
             )  # fmt: skip
         welded = body.add_body(  # a part without joints, as sensors and covers are
             pos=generator.uniform(-0.1, 0.1, 3), quat=generator.normal(size=4), mass=0.3, inertia=[0.001] * 3,
@@ -178,3 +187,79 @@ def test_errors_name_the_joint_and_what_exists() -> None:
     )
     with pytest.raises(ConfigurationError, match="'rail' of the rigid model is no hinge; trees of hinges are needed"):
         RigidBody(slide, ["rail"])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A free base
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def floating_tree(seed: int) -> tuple[mujoco.MjModel, list[str], Array]:
+    """A tree on a free base, its hinges in another order than the model's, and their columns in qvel."""
+    model = random_tree(seed, floating=True)
+    order = 1 + np.random.default_rng(seed).permutation(model.njnt - 1)
+    names = [model.joint(int(j)).name for j in order]
+    return model, names, model.jnt_dofadr[order]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_inverse_dynamics_on_a_level_base_is_mujocos(seed: int) -> None:
+    """Catches base and hinges that are mixed up, the base's acceleration without its mass, and a moment elsewhere."""
+    model, names, columns = floating_tree(seed)
+    generator = np.random.default_rng(seed)
+    q, q_dot, q_ddot = generator.uniform(-2.0, 2.0, (3, 4, len(names)))
+    base, base_dot, base_ddot = generator.uniform(-2.0, 2.0, (3, 4, 3))
+    wrench, torque = FloatingBody(model, names).inverse_dynamics(q, base_dot, q_dot, base_ddot, q_ddot)
+    for row in range(4):
+        data = mujoco.MjData(model)
+        data.qpos[:3], data.qpos[3:7], data.qpos[columns + 1] = base[row], [1.0, 0.0, 0.0, 0.0], q[row]
+        data.qvel[:3], data.qvel[columns] = base_dot[row], q_dot[row]
+        data.qacc[:3], data.qacc[columns] = base_ddot[row], q_ddot[row]
+        mujoco.mj_inverse(model, data)
+        np.testing.assert_allclose(wrench[row], data.qfrc_inverse[:6], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(torque[row], data.qfrc_inverse[columns], rtol=0.0, atol=1e-9)
+    assert np.abs(wrench).min(axis=0).max() > 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mass_matrix_of_a_floating_tree_is_mujocos(seed: int) -> None:
+    """Catches the lower triangle left empty, rows and columns in different orders, and rotation before translation."""
+    model, names, columns = floating_tree(seed)
+    q = np.random.default_rng(seed).uniform(-2.0, 2.0, len(names))
+    data = mujoco.MjData(model)
+    data.qpos[3:7], data.qpos[columns + 1] = [1.0, 0.0, 0.0, 0.0], q
+    mujoco.mj_forward(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    order = np.concatenate([np.arange(6), columns])
+    mass = FloatingBody(model, names).mass_matrix(q)
+    np.testing.assert_allclose(mass, full[np.ix_(order, order)], rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(mass[:3, :3], model.body_mass.sum() * np.eye(3), rtol=0.0, atol=1e-11)
+
+
+def test_center_of_mass_of_a_floating_tree_is_mujocos() -> None:
+    """Catches a center of mass in the world or without the base, and rows that are all the last one."""
+    model, names, columns = floating_tree(0)
+    generator = np.random.default_rng(0)
+    q = generator.uniform(-2.0, 2.0, (5, len(names)))
+    com = FloatingBody(model, names).center_of_mass(q)
+    assert com.shape == (5, 3)
+    for row in range(5):
+        data = mujoco.MjData(model)
+        data.qpos[:7], data.qpos[columns + 1] = generator.normal(size=7), q[row]
+        mujoco.mj_forward(model, data)
+        R = data.body("base").xmat.reshape(3, 3)
+        expected = (data.body("base").subtree_com - data.body("base").xpos) @ R
+        np.testing.assert_allclose(com[row], expected, rtol=0.0, atol=1e-12)
+
+
+def test_a_base_that_is_not_free_is_an_error() -> None:
+    """Catches a fixed robot that is taken for a floating one, and hinges that are left out of it."""
+    fixed = random_tree(0)
+    with pytest.raises(ConfigurationError, match=r"^a floating robot needs one free joint, this model has 0$"):
+        FloatingBody(fixed, shuffled_names(fixed, 0)[0])
+    model, names, _ = floating_tree(0)
+    with pytest.raises(ConfigurationError, match=rf"all {len(names)} joints must be named .*got {len(names) - 1}"):
+        FloatingBody(model, names[1:])
+    with pytest.raises(ConfigurationError, match=r"unknown joint of the rigid model 'free'; choose one of: hinge0_0"):
+        FloatingBody(model, ["free", *names[1:]])

@@ -1,0 +1,346 @@
+"""Statics of the legs: MuJoCo's kinematics, bias forces and contact Jacobians, Pinocchio, finite differences."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from elastic_env.errors import ConfigurationError
+from elastic_env.rigid_body import FloatingBody
+from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped
+from elastic_env.signals import Array
+from elastic_env.walking.leg_chains import (
+    LegChains,
+    LegFrames,
+    cross,
+    dot,
+    holding_torque,
+    holding_torque_gradient,
+    rotated,
+)
+
+ROBOT = biped(Thormang())
+AXES = (1, 0, 2, 1)  # y, x, z, y
+SPIDER = [[f"leg{leg}_joint{j}" for j in range(len(AXES))] for leg in range(3)]
+
+
+def spider_spec() -> mujoco.MjSpec:
+    """A trunk in the air, tilted gravity, three legs of four hinges, all of them different."""
+    generator = np.random.default_rng(5)
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.gravity = [1.3, -0.7, -9.2]
+    trunk = spec.worldbody.add_body(name="trunk", pos=[0.4, -0.3, 0.9], quat=[0.8, 0.1, -0.5, 0.3])
+    trunk.add_freejoint(name="base")
+    add_inertia(trunk, generator)
+    head = trunk.add_body(name="head", pos=[0.1, 0.2, 0.3], quat=[0.9, 0.3, 0.1, 0.2])
+    add_inertia(head, generator)
+    for names in SPIDER:
+        body = trunk
+        for name, axis in zip(names, AXES, strict=True):
+            body = body.add_body(name=f"{name}_link", pos=generator.uniform(-0.4, 0.4, 3))
+            body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=np.eye(3)[axis])
+            add_inertia(body, generator)
+    return spec
+
+
+def add_inertia(body: Any, generator: np.random.Generator) -> None:
+    """A random mass with a turned inertia off the origin."""
+    body.mass, body.ipos, body.iquat = (
+        generator.uniform(0.5, 4.0),
+        generator.uniform(-0.2, 0.2, 3),
+        [0.7, 0.1, 0.5, 0.5],
+    )
+    body.inertia, body.explicitinertial = generator.uniform(0.02, 0.03, 3), True
+
+
+SPIDER_MODEL = spider_spec().compile()
+MODELS = {
+    "thormang": (ROBOT.rigid, [list(LEG_JOINTS[:6]), list(LEG_JOINTS[6:])]),
+    "loaded thormang": (biped(Thormang(torso_load_kg=5.0)).rigid, [list(LEG_JOINTS[:6]), list(LEG_JOINTS[6:])]),
+    "spider": (SPIDER_MODEL, SPIDER),
+}
+
+
+class Posed:
+    """A robot of MuJoCo in a random attitude, as the pelvis sees it."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        generator = np.random.default_rng(seed)
+        self.model, self.legs = MODELS[name]
+        self.data = mujoco.MjData(self.model)
+        self.q = generator.uniform(-1.2, 1.2, (len(self.legs), len(self.legs[0])))
+        self.data.qpos[:3], self.data.qpos[3:7] = generator.normal(size=3), generator.normal(size=4)
+        self.data.qpos[3:7] /= np.linalg.norm(self.data.qpos[3:7])
+        self.joints = np.array([[self.model.joint(joint).id for joint in leg] for leg in self.legs])
+        self.feet = self.model.jnt_bodyid[self.joints[:, -1]]
+        self.set(self.q)
+        self.pelvis, self.R = self.data.qpos[:3].copy(), self.data.xmat[1].reshape(3, 3).copy()
+        self.gravity = self.model.opt.gravity @ self.R
+        self.force, self.point_of_foot, self.moment = generator.normal(size=(3, len(self.legs), 3))
+        self.force, self.moment = 300.0 * self.force, 20.0 * self.moment
+
+    def set(self, q: Array) -> None:
+        """Move the legs."""
+        self.data.qpos[self.model.jnt_qposadr[self.joints]] = q
+        mujoco.mj_forward(self.model, self.data)
+
+    def seen(self, vectors: Array) -> Array:
+        """Vectors of the world in the pelvis frame."""
+        return vectors @ self.R
+
+    def point(self, frames: LegFrames) -> Array:
+        """The points fixed in the feet, in the pelvis frame."""
+        return frames.ankle + (frames.foot_R @ self.point_of_foot[..., None])[..., 0]
+
+    def torque(self, q: Array, moment: bool = False) -> Array:
+        """Bias force of the rigid robot less JᵀF of forces that are fixed to the pelvis frame, (L, J)."""
+        self.set(q)
+        torque = self.data.qfrc_bias.copy()
+        for leg, foot in enumerate(self.feet):
+            point = self.data.xpos[foot] + self.data.xmat[foot].reshape(3, 3) @ self.point_of_foot[leg]
+            translation, rotation = np.zeros((2, 3, self.model.nv))
+            mujoco.mj_jac(self.model, self.data, translation, rotation, point, foot)
+            torque -= translation.T @ self.R @ self.force[leg]
+            if moment:
+                torque -= rotation.T @ self.R @ self.moment[leg]
+        return torque[self.model.jnt_dofadr[self.joints]]
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_are_those_of_mujoco(name: str, seed: int) -> None:
+    """Catches a link that turns about the wrong axis or sense, and masses that are hung on the wrong joint."""
+    posed = Posed(name, seed)
+    frames = LegChains(posed.model, posed.legs).frames(posed.q)
+    data, bodies = posed.data, posed.model.jnt_bodyid[posed.joints]
+    np.testing.assert_allclose(frames.axes, posed.seen(data.xaxis[posed.joints]), rtol=0.0, atol=1e-12)
+    anchors = posed.seen(data.xanchor[posed.joints] - posed.pelvis)
+    np.testing.assert_allclose(frames.anchors, anchors, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(frames.ankle, frames.anchors[:, -1])
+    np.testing.assert_allclose(frames.foot_R, posed.R.T @ data.xmat[posed.feet].reshape(-1, 3, 3), atol=1e-12)
+    carried = posed.seen(data.subtree_com[bodies] - posed.pelvis) - anchors
+    levers = posed.model.body_subtreemass[bodies][..., None] * carried
+    np.testing.assert_allclose(frames.levers, levers, rtol=0.0, atol=1e-11)
+    assert np.abs(levers).max() > 0.5
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_center_of_mass_is_that_of_mujoco_and_of_pinocchio(name: str) -> None:
+    """Catches a body of the trunk that is left out, counted twice, or not turned into the pelvis frame."""
+    for seed in range(5):
+        posed = Posed(name, seed)
+        chains = LegChains(posed.model, posed.legs)
+        com = chains.frames(posed.q).com
+        np.testing.assert_allclose(com, posed.seen(posed.data.subtree_com[0] - posed.pelvis), rtol=0.0, atol=1e-12)
+        assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(posed.model), rel=1e-14)
+        names = [joint for leg in posed.legs for joint in leg]
+        level = FloatingBody(posed.model, names).center_of_mass(posed.q.reshape(1, -1))[0]
+        np.testing.assert_allclose(com, level, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_holding_torque_is_the_bias_force_less_the_contact_forces(name: str) -> None:
+    """Catches a sign or lever of Eq. 4, a leg without its own weight, and a moment that is lost."""
+    for seed in range(10):
+        posed = Posed(name, seed)
+        frames = LegChains(posed.model, posed.legs).frames(posed.q)
+        point = posed.point(frames)
+        torque = holding_torque(frames, posed.gravity, posed.force, point)
+        np.testing.assert_allclose(torque, posed.torque(posed.q), rtol=0.0, atol=1e-9)
+        torque = holding_torque(frames, posed.gravity, posed.force, point, posed.moment)
+        np.testing.assert_allclose(torque, posed.torque(posed.q, moment=True), rtol=0.0, atol=1e-9)
+        unloaded = holding_torque(frames, posed.gravity, np.zeros_like(posed.force), point)
+        bias = posed.data.qfrc_bias[posed.model.jnt_dofadr[posed.joints]]
+        np.testing.assert_allclose(unloaded, bias, rtol=0.0, atol=1e-9)
+
+
+def test_holding_torque_is_that_of_pinocchio() -> None:
+    """Catches a slip that MuJoCo's conventions would share: gravity torques of the other engine, pelvis level."""
+    q = np.random.default_rng(3).uniform(-1.0, 1.0, (20, 12))
+    still, rest = np.zeros((20, 3)), np.zeros((20, 12))
+    _, expected = FloatingBody(ROBOT.rigid, LEG_JOINTS).inverse_dynamics(q, still, rest, still, rest)
+    frames = ROBOT.chains.frames(q.reshape(20, 2, 6))
+    torque = holding_torque(frames, ROBOT.rigid.opt.gravity, np.zeros((20, 2, 3)), frames.ankle)
+    np.testing.assert_allclose(torque.reshape(20, 12), expected, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_feet_that_a_sensor_weighs_weigh_nothing(name: str) -> None:
+    """Catches feet that still count in the center of mass, the levers or the mass, and links that count no more."""
+    model, legs = MODELS[name]
+    footless = copy.copy(model)
+    footless.body_mass[[model.jnt_bodyid[model.joint(leg[-1]).id] for leg in legs]] = 0.0
+    chains, expected = LegChains(model, legs, feet_weigh=False), LegChains(footless, legs)
+    q = np.random.default_rng(4).uniform(-1.0, 1.0, (5, len(legs), len(legs[0])))
+    assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(footless), rel=1e-12)
+    assert chains.mass < mujoco.mj_getTotalmass(model) - 1.0
+    for part in ("axes", "anchors", "levers", "foot_R", "com"):
+        one, other = getattr(chains.frames(q), part), getattr(expected.frames(q), part)
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12, err_msg=part)
+    assert ROBOT.chains_above_feet.mass == pytest.approx(57.0 - 2.0 * 1.616, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["thormang", "spider"])
+def test_gradient_is_the_difference_quotient_of_mujocos_torque(name: str) -> None:
+    """Catches a force that turns with the foot, a point that stays behind, and a term of j < i that is not mirrored."""
+    h = 1e-5
+    for seed in range(3):
+        posed = Posed(name, seed)
+        frames = LegChains(posed.model, posed.legs).frames(posed.q)
+        gradient = holding_torque_gradient(frames, posed.gravity, posed.force, posed.point(frames))
+        legs, joints = posed.q.shape
+        for j in range(joints):
+            step = np.zeros((legs, joints))
+            step[:, j] = h
+            quotient = (posed.torque(posed.q + step) - posed.torque(posed.q - step)) / (2.0 * h)
+            np.testing.assert_allclose(gradient[:, :, j], quotient, rtol=0.0, atol=1e-6)
+        np.testing.assert_array_equal(gradient, gradient.swapaxes(-1, -2))
+        assert np.abs(gradient).max() > 50.0
+
+
+def torques_of_figure_1(inward: float) -> dict[str, float]:
+    """Left stance, right foot lifted 0.05 m, hip axis at 0.66 m, the center of mass over the ZMP."""
+    ankles = np.array([[0.0, 0.105, 0.1], [0.0, -0.105, 0.15]])
+    zmp, pelvis = np.array([0.0, 0.105 - inward, 0.0]), np.array([0.0, 0.0, 0.66])
+    for _ in range(50):
+        frames = ROBOT.chains.frames(ROBOT.joint_angles(pelvis, ankles).reshape(2, 6))
+        pelvis[:2] += (zmp - pelvis - frames.com)[:2]
+    np.testing.assert_allclose((pelvis + frames.com)[:2], zmp[:2], rtol=0.0, atol=1e-12)
+    force = np.array([[0.0, 0.0, 57.0 * 9.81], [0.0, 0.0, 0.0]])
+    torque = holding_torque(frames, np.array([0.0, 0.0, -9.81]), force, np.tile(zmp - pelvis, (2, 1)))
+    return dict(zip(LEG_JOINTS, torque.ravel().tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("inward", "hip_roll", "ankle_roll", "knee", "hip_pitch"),
+    [(0.0, 65.5, 0.0, 36.0, 8.3), (0.02, 64.0, 11.2, 40.0, 8.7), (0.04, 62.5, 22.4, 44.0, 9.0)],
+)
+def test_stance_leg_of_figure_1_holds_what_the_facts_say(
+    inward: float, hip_roll: float, ankle_roll: float, knee: float, hip_pitch: float
+) -> None:
+    """Catches the force at the ankle axis in place of the ZMP: hip roll 60.4 and ankle roll 0 N·m in the middle row."""
+    torque = torques_of_figure_1(inward)
+    assert abs(torque["l_hip_roll"]) == pytest.approx(hip_roll, abs=0.1)
+    assert abs(torque["l_ankle_roll"]) == pytest.approx(ankle_roll, abs=0.1)
+    assert abs(torque["l_knee"]) == pytest.approx(knee, abs=0.5)
+    assert abs(torque["l_hip_pitch"]) == pytest.approx(hip_pitch, abs=0.1)
+
+
+def test_swing_leg_of_figure_1_holds_its_own_weight() -> None:
+    """Catches a swing leg without mass: hip roll -5, hip pitch -9, knee 5 N·m."""
+    torque = torques_of_figure_1(0.02)
+    assert torque["r_hip_roll"] == pytest.approx(-5.0, abs=0.5)
+    assert torque["r_hip_pitch"] == pytest.approx(-9.0, abs=0.5)
+    assert torque["r_knee"] == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (7,), (64,), (2, 5), (0,)])
+def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(shape: tuple[int, ...]) -> None:
+    """Catches worlds that are mixed up, and a world whose result depends on how many there are."""
+    generator = np.random.default_rng(6)
+    chains = LegChains(SPIDER_MODEL, SPIDER)
+    q = generator.uniform(-1.0, 1.0, (*shape, 3, 4))
+    gravity = generator.normal(size=(*shape, 3))
+    force, offset, moment = generator.normal(size=(3, *shape, 3, 3))
+
+    def everything(row: tuple[int, ...]) -> list[Array]:
+        frames = chains.frames(q[row])
+        point = frames.ankle + offset[row]
+        return [
+            frames.axes, frames.anchors, frames.levers, frames.foot_R, frames.com, frames.ankle,
+            holding_torque(frames, gravity[row], force[row], point),
+            holding_torque(frames, gravity[row], force[row], point, moment[row]),
+            holding_torque_gradient(frames, gravity[row], force[row], point),
+        ]  # fmt: skip
+
+    whole = everything(())
+    shapes = [(3, 4, 3), (3, 4, 3), (3, 4, 3), (3, 3, 3), (3,), (3, 3), (3, 4), (3, 4), (3, 4, 4)]
+    assert [result.shape for result in whole] == [(*shape, *own) for own in shapes]
+    for row in np.ndindex(shape):
+        for result, alone in zip(whole, everything(row), strict=True):
+            np.testing.assert_array_equal(result[row], alone)
+
+
+def test_one_gravity_serves_a_batch() -> None:
+    """Catches a gravity that is needed for each world although it is the same in all of them."""
+    generator = np.random.default_rng(7)
+    q, force = generator.normal(size=(4, 2, 6)), generator.normal(size=(4, 2, 3))
+    frames, gravity = ROBOT.chains.frames(q), np.array([0.1, 0.2, -9.8])
+    each = np.tile(gravity, (4, 1))
+    for function in (holding_torque, holding_torque_gradient):
+        one = function(frames, gravity, force, frames.ankle)
+        np.testing.assert_array_equal(one, function(frames, each, force, frames.ankle))
+
+
+def turned(spec: mujoco.MjSpec) -> None:
+    """A link that is not parallel to the pelvis."""
+    spec.body("leg1_joint2_link").quat = [0.99, 0.1, 0.0, 0.0]
+
+
+def shifted(spec: mujoco.MjSpec) -> None:
+    """A hinge off its link's origin."""
+    spec.joint("leg0_joint1").pos = [0.0, 0.0, 0.01]
+
+
+def slanted(spec: mujoco.MjSpec) -> None:
+    """An axis between two coordinate axes."""
+    spec.joint("leg2_joint0").axis = [0.0, 1.0, 0.1]
+
+
+def reversed_axis(spec: mujoco.MjSpec) -> None:
+    """A hinge that turns the other way on one leg."""
+    spec.joint("leg1_joint0").axis = [0.0, -1.0, 0.0]
+
+
+def reversed_everywhere(spec: mujoco.MjSpec) -> None:
+    """A hinge that turns the other way on all legs."""
+    for leg in range(3):
+        spec.joint(f"leg{leg}_joint3").axis = [0.0, -1.0, 0.0]
+
+
+def other_order(spec: mujoco.MjSpec) -> None:
+    """Two hinges in another order on one leg."""
+    spec.joint("leg1_joint0").axis, spec.joint("leg1_joint1").axis = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+
+
+def doubled(spec: mujoco.MjSpec) -> None:
+    """A link with two hinges."""
+    spec.body("leg0_joint2_link").add_joint(name="second", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [turned, shifted, slanted, reversed_axis, reversed_everywhere, other_order, doubled],
+    ids=lambda f: f.__name__,
+)
+def test_a_leg_that_the_formulas_do_not_cover_is_refused(change: Callable[[mujoco.MjSpec], None]) -> None:
+    """Catches torques of a leg whose links are turned, or whose hinges are not where or as they are assumed."""
+    spec = spider_spec()
+    LegChains(spec.compile(), SPIDER)
+    change(spec)
+    with pytest.raises(
+        ConfigurationError, match=r"every leg must be a chain of links with one hinge each.*leg0_joint0"
+    ):
+        LegChains(spec.compile(), SPIDER)
+
+
+@pytest.mark.parametrize("order", [[0, 2, 1, 3], [0, 1, 3]])
+def test_joints_that_do_not_follow_one_another_are_refused(order: list[int]) -> None:
+    """Catches joints named in another order than they are chained, and a joint that is left out."""
+    with pytest.raises(ConfigurationError, match="every leg must be a chain"):
+        LegChains(SPIDER_MODEL, [[leg[j] for j in order] for leg in SPIDER])
+
+
+def test_products_are_those_of_numpy() -> None:
+    """Catches a component of the fast products that is swapped, and broadcasting in one direction only."""
+    generator = np.random.default_rng(8)
+    R, v = generator.normal(size=(2, 4, 3, 3)), generator.normal(size=(2, 4, 3))
+    for a, b in [((3,), (3,)), ((2, 4, 3), (2, 4, 3)), ((4, 3), (2, 1, 3)), ((3,), (5, 3)), ((5, 3), (3,))]:
+        x, y = generator.normal(size=a), generator.normal(size=b)
+        np.testing.assert_allclose(cross(x, y), np.cross(x, y), rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(dot(x, y), (x * y).sum(axis=-1), rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(rotated(R, v), np.einsum("...ij,...j->...i", R, v), rtol=0.0, atol=1e-14)
