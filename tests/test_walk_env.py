@@ -666,6 +666,14 @@ def test_a_slope_tilts_the_ground_under_the_soles_and_the_robot_stands_on_it() -
     assert len(directions) > 1
 
 
+def test_backlash_is_a_dead_band_of_every_spring() -> None:
+    """Catches a backlash that the physics does not have, or the truth does not tell."""
+    env = walk_env(scenario="backlash")
+    springs = [env.task.model.tendon(spring_name(joint)).id for joint in JOINTS]
+    np.testing.assert_allclose(env.simulation.model.tendon_lengthspring[springs], [[-1.75e-3 / 2, 1.75e-3 / 2]] * 12)
+    assert env.truth().model.backlash.tolist() == [1.75e-3] * 12
+
+
 @pytest.mark.parametrize("scenario", ["soft", "stiff", "payload", "spread", "backlash", "sensor", "push", "slope"])
 def test_the_assumed_model_and_the_reference_do_not_know_the_scenario(scenario: str) -> None:
     """Catches a compensator, or a plan, that is told the true stiffness, mass, backlash or slope."""
@@ -898,6 +906,23 @@ def test_names_of_metrics_say_signal_statistic_phase_and_unit() -> None:
     required |= {f"pelvis_error_{phase}_rms_rad" for phase in ("double", "single", "transition")}
     required |= {f"zmp_deviation_{phase}_rms_m" for phase in ("double", "single", "transition")}
     assert required <= set(names)
+    others = {
+        "link_error_rms_rad": ("link_error", "rms", "scored"),
+        "link_error_min_rad": ("link_error_lowest", "min", "scored"),
+        "link_error_max_rad": ("link_error_highest", "max", "scored"),
+        "deflection_rms_rad": ("deflection", "rms", "scored"),
+        "servo_torque_rms_nm": ("servo_torque", "rms", "scored"),
+        "joint_torque_peak_nm": ("joint_torque", "peak", "all"),
+        "early_touchdown_mean_s": ("early_touchdown", "mean", "touchdown"),
+        "early_touchdown_max_s": ("early_touchdown", "max", "touchdown"),
+        "unloaded_samples_count": ("zmp_deviation", "count", "unloaded"),
+        "command_rate_rms_rad_s": ("command_rate", "rms", "all"),
+        "command_rate_peak_rad_s": ("command_rate", "peak", "all"),
+        "clipped_share": ("clipped", "mean", "all"),
+        "duration_s": ("time_s", "max", "all"),
+    }
+    described = {metric.name: (metric.signal, metric.statistic, metric.over) for metric in metrics}
+    assert {name: described[name] for name in others} == others
 
 
 def test_an_early_touchdown_is_measured_from_the_first_load_on_the_descending_foot(open_loop: Recording) -> None:
