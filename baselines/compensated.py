@@ -34,7 +34,7 @@ class Compensated:
         self.policy, self.compensator = policy, compensator
         model = compensator.model
         self._shows_rates = getattr(policy, "reads_rates", True)
-        self._view = ObservationView(model.observation_table)
+        self._view = ObservationView(model.observation_table, model.control_period_s)
         self._ramp = Ramp(model, ramp_s)
 
     def predict(

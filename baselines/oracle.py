@@ -40,7 +40,7 @@ class Oracle:
         self.policy, self.integral_gain = policy, integral_gain
         self._env = env.unwrapped
         model = self._env.truth().model
-        self._view = ObservationView(self._env.task.observation_table)
+        self._view = ObservationView(self._env.task.observation_table, model.control_period_s)
         self._compensator = DynamicCompensator(model, friction=friction)
         self._dt = model.control_period_s
         self._ramp = Ramp(model, ramp_s)

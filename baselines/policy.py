@@ -51,8 +51,9 @@ class Zero:
 class ObservationView:
     """Where an observation table holds what compensators need, by name."""
 
-    def __init__(self, table: SignalTable) -> None:
-        self._width = len(table)
+    def __init__(self, table: SignalTable, control_period_s: float) -> None:
+        self._width, self._period_s = len(table), control_period_s
+        self._clock = table.group("clock") if "clock.time" in table.names else None
         self._theta, self._theta_dot = table.group("encoder_angle"), table.group("encoder_rate")
         self._q, self._q_dot = table.group("reference_angle"), table.group("reference_rate")
         self._q_ddot, self._command = table.group("reference_acceleration"), table.group("last_command")
@@ -90,7 +91,9 @@ class ObservationView:
         return rows
 
     def is_start(self, rows: Array) -> BoolArray:
-        """Whether an observation can be the first of an episode: standing, and nothing commanded yet."""
+        """Whether an observation can be the first of an episode: by its clock, or standing with nothing commanded."""
+        if self._clock is not None:
+            return rows[:, self._clock][:, 0] < 1.5 * self._period_s
         standing = (rows[:, self._q_dot] == 0.0).all(axis=1)
         return standing & (rows[:, self._command] == rows[:, self._q]).all(axis=1)
 

@@ -25,7 +25,7 @@ from baselines.policy import Action, ObservationView, resume
 from elastic_env.config import Model, quantity
 from elastic_env.plan import STAND_S, quintic
 from elastic_env.robots.robot_model import WalkerModel
-from elastic_env.signals import Array
+from elastic_env.signals import Array, IntArray
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import shares
 from elastic_env.walking.gait import LEFT, RIGHT
@@ -74,7 +74,7 @@ def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
 class WalkingController:
     """Commands a walker around its plan, see the module.
 
-    Memory per world: steps, leg length difference, COM from both soles, COM velocity, ZMP shift.
+    Memory per world: steps, leg length difference, COM from both soles, deviation of its velocity, ZMP shift.
 
     Args:
         model: Assumed walker.
@@ -96,7 +96,7 @@ class WalkingController:
         self._model, self._biped, self._plan = model, model.biped, model.plan
         self._com_feedback, self._gains = com_feedback, gains or WalkingGains()
         table = model.observation_table
-        self._view = ObservationView(table)
+        self._view = ObservationView(table, model.control_period_s)
         self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
         self._clock, self._share = table.group("clock"), table.group("load_share")
         self._dt = model.control_period_s
@@ -119,10 +119,11 @@ class WalkingController:
         steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
         steps = steps + 1.0
         share, _, _ = quintic(steps / self._ramp_steps)
-        z = self._leg_difference(rows, z)
+        row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
+        z = self._leg_difference(rows, row, z)
         coms = frame.com_from_soles[..., :2]
         if self._com_feedback:
-            velocity, shift = self._zmp_shift(rows, coms, last.reshape(coms.shape), velocity, shift)
+            velocity, shift = self._zmp_shift(rows, row, coms, last.reshape(coms.shape), velocity, shift)
         feedback = share * (self._leg_offsets(rows, z) + self._ankle_offsets(rows, shift))
         action = feedback + self._friction_offsets(rows)
         kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift])
@@ -139,12 +140,12 @@ class WalkingController:
         zero = np.zeros((len(coms), 1))
         return np.hstack([zero, zero, coms, zero, zero, zero, zero])
 
-    def _leg_difference(self, rows: Array, z: Array) -> Array:
+    def _leg_difference(self, rows: Array, row: IntArray, z: Array) -> Array:
         """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
         gains = self._gains
         weight = self._biped.weight
         vertical = self._vertical_forces(rows)
-        desired = (1.0 - 2.0 * rows[:, self._share]) * weight
+        desired = (1.0 - 2.0 * self._plan.share[row, None]) * weight
         missing = desired - (vertical[:, [LEFT]] - vertical[:, [RIGHT]])
         z = z + self._dt * (gains.force_difference * missing - z / gains.force_difference_decay_s)
         return np.clip(z, -gains.force_difference_limit_m, gains.force_difference_limit_m)
@@ -153,16 +154,16 @@ class WalkingController:
         """Along the legs' soles, which are nearly level, (num_worlds, 2) [N]."""
         return rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2]
 
-    def _zmp_shift(self, rows: Array, coms: Array, last: Array, velocity: Array, shift: Array) -> tuple[Array, Array]:
-        """Filtered COM velocity and ZMP shift, (num_worlds, 2) each [m/s], [m]."""
+    def _zmp_shift(
+        self, rows: Array, row: IntArray, coms: Array, last: Array, velocity: Array, shift: Array
+    ) -> tuple[Array, Array]:
+        """Filtered deviation of the COM velocity from the plan, and ZMP shift, (num_worlds, 2) each [m/s], [m]."""
         gains, plan = self._gains, self._plan
         worlds, support = np.arange(len(rows)), rows[:, self._clock][:, 2].astype(np.int64)
-        row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, plan.num_steps)
-        com = coms[worlds, support] + self._biped.footholds[support]
-        change = (coms - last)[worlds, support] / self._dt
+        deviation = coms[worlds, support] + self._biped.footholds[support] - plan.com[row]
+        change = (coms - last)[worlds, support] / self._dt - plan.com_dot[row]
         velocity = velocity + _share(self._dt, gains.velocity_filter_s) * (change - velocity)
-        omega = plan.omega
-        error = com + velocity / omega - plan.com[row] - plan.com_dot[row] / omega
+        error = deviation + velocity / plan.omega
         wanted = np.clip(gains.dcm * error, -gains.zmp_limit_m, gains.zmp_limit_m)
         return velocity, shift + _share(self._dt, gains.zmp_filter_s) * (wanted - shift)
 

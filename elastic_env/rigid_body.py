@@ -87,6 +87,7 @@ class FloatingBody:
         names = [self._model.joints[self._model.getJointId(joint)] for joint in joints]
         self._base_q, self._base_v = base.idx_q, base.idx_v
         self._q = np.array([joint.idx_q for joint in names])
+        self._zero = np.array([model.qpos0[model.joint(joint).qposadr[0]] for joint in joints])
         self._v = np.array([joint.idx_v for joint in names])
 
     def inverse_dynamics(
@@ -109,7 +110,7 @@ class FloatingBody:
         position[base_q + 6] = 1.0  # the unit quaternion of a level base
         wrench, torque = np.empty((len(q), 6)), np.empty(q.shape)
         for i in range(len(q)):
-            position[self._q] = q[i]
+            position[self._q] = q[i] - self._zero
             velocity[base_v : base_v + 3], velocity[self._v] = base_dot[i], q_dot[i]
             acceleration[base_v : base_v + 3], acceleration[self._v] = base_ddot[i], q_ddot[i]
             effort = pinocchio.rnea(self._model, self._data, position, velocity, acceleration)
@@ -119,7 +120,7 @@ class FloatingBody:
     def mass_matrix(self, q: Array) -> Array:
         """Inertia of base translation, base rotation and hinges, (n,) [rad] to (6 + n, 6 + n) [kg], [kg·m], [kg·m²]."""
         position = np.zeros(self._model.nq)
-        position[self._base_q + 6], position[self._q] = 1.0, q
+        position[self._base_q + 6], position[self._q] = 1.0, q - self._zero
         rows = np.concatenate([np.arange(self._base_v, self._base_v + 6), self._v])
         full = pinocchio.crba(self._model, self._data, position)
         return np.triu(full)[np.ix_(rows, rows)] + np.triu(full, 1).T[np.ix_(rows, rows)]
@@ -130,7 +131,7 @@ class FloatingBody:
         position[self._base_q + 6] = 1.0
         com = np.empty((len(q), 3))
         for i in range(len(q)):
-            position[self._q] = q[i]
+            position[self._q] = q[i] - self._zero
             com[i] = pinocchio.centerOfMass(self._model, self._data, position)
         return com
 

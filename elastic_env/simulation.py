@@ -28,7 +28,7 @@ class Simulation(Protocol):
         """A live (num_worlds, ...) view of a field of `MjData`.
 
         Inputs such as `xfrc_applied` can be written. Derived fields and sensors lag one physics step behind the state,
-        as after `mj_step`.
+        as after `mj_step`; they are filled by the calls after they were first bound, so bind them before `refresh`.
         """
         ...
 
@@ -106,6 +106,7 @@ class ManyWorlds:
         self.model = model
         self.num_worlds = num_worlds
         self._varied: set[str] = set()
+        self._bound: set[str] = set()
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=min(num_threads or os.cpu_count() or 1, num_worlds))
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
@@ -114,12 +115,15 @@ class ManyWorlds:
         copied = ManyWorlds(self.model, self.num_worlds, self._batch.nthread)
         for field in self._varied:
             copied.vary(field)[:] = self.vary(field)
+        for field in self._bound:
+            copied.bind(field)
         copied._batch.state[:] = self._batch.state
         copied._batch.warning[:] = self._batch.warning
         return copied
 
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
+        self._bound.add(field)
         return self._batch.bind(field)
 
     def vary(self, field: str) -> Array:

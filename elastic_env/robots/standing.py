@@ -50,13 +50,15 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
     data.qpos[:3] = pelvis
     data.qpos[at.q] = data.qpos[at.theta] = q
     data.ctrl[:] = command
+    was_calm = False
     substeps = round(_CHECK_EVERY_S / calm.opt.timestep)
     for _ in range(round(_LONGEST_S / _CHECK_EVERY_S)):
         mujoco.mj_step(calm, data, substeps)
         rate = float(np.abs(data.qvel).max())
         if not np.isfinite(rate) or data.qpos[2] < 0.5 * pelvis[2]:
             break
-        if rate < _REST_RATE:
+        was_calm, is_calm = rate < _REST_RATE, was_calm and rate < _REST_RATE
+        if is_calm:  # twice in a row: once may be the turning point of a swing
             return Equilibrium(data.qpos.copy(), data.act.copy(), data.qacc_warmstart.copy())
     raise ElasticError(
         f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and moving with "

@@ -121,6 +121,8 @@ class WalkTask:
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place robots in static equilibrium under zero offset."""
         scenario = self.config.scenario
+        for field in _DERIVED:
+            simulation.bind(field)
         simulation.bind("xfrc_applied")[worlds] = 0.0
         for world in np.flatnonzero(worlds).tolist():
             generator = generators[world]
@@ -366,6 +368,8 @@ def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
     return WalkerModel(config.true_joints, true.rigid, config.control_period_s, OBSERVATION, biped=true, plan=plan)
 
 
+_DERIVED = ("sensordata", "site_xpos", "site_xmat", "actuator_force")
+"""What is read of the physics beside its state."""
 _NOISE_WIDTH = 2 + 3 + 12
 
 

@@ -129,8 +129,9 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     of_walk = np.clip(step, 0, gait.num_steps - 1)
     within = since - of_walk * period - first  # control steps since lift-off
     swing = np.clip(within / single, 0.0, 1.0)
-    margin = TRANSITION_S / control_period_s
-    nearest = np.minimum(np.abs(within), np.abs(within - single))
+    lift_offs = np.arange(gait.num_steps) * period + first
+    events = np.concatenate([lift_offs, lift_offs + single])
+    nearest = np.abs(since[:, None] - events).min(axis=1)
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
@@ -138,7 +139,7 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
         support=of_walk % 2,
         single=(within > 0) & (within < single),
         swing=swing,
-        transition=walking & (nearest <= margin + 1e-9),
+        transition=walking & (nearest * control_period_s <= TRANSITION_S + 1e-9),
         walking=walking,
     )
 

@@ -63,6 +63,8 @@ class LegChains:
     """
 
     def __init__(self, model: mujoco.MjModel, legs: Sequence[Sequence[str]], feet_weigh: bool = True) -> None:
+        if len({len(leg) for leg in legs}) != 1:
+            raise ConfigurationError(f"all legs must have equally many joints, got {[len(leg) for leg in legs]}")
         joints = np.array([[model.joint(name).id for name in leg] for leg in legs])
         bodies = model.jnt_bodyid[joints]
         self._axis = np.argmax(np.abs(model.jnt_axis[joints[0]]), axis=-1)
@@ -193,12 +195,24 @@ def _vectors_last(array: Array) -> Array:
 
 
 def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:
-    level = np.allclose(model.body_quat[bodies], [1.0, 0.0, 0.0, 0.0], atol=1e-12)
-    single = (model.body_jntnum[bodies] == 1).all() and np.allclose(model.jnt_pos[joints], 0.0, atol=1e-12)
-    chained = (model.body_parentid[bodies[:, 1:]] == bodies[:, :-1]).all()
-    aligned = np.allclose(model.jnt_axis[joints], np.eye(3)[axis], atol=1e-12)
-    if not (level and single and chained and aligned):
+    requirements = {
+        "links parallel to the pelvis at zero angles": np.allclose(model.body_quat[bodies], [1.0, 0.0, 0.0, 0.0]),
+        "one hinge per link, at its origin and zero at the zero angle": (
+            (model.body_jntnum[bodies] == 1).all()
+            and (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE).all()
+            and not model.jnt_pos[joints].any()
+            and not model.qpos0[model.jnt_qposadr[joints]].any()
+        ),
+        "axes +x, +y or +z in the same order": np.allclose(model.jnt_axis[joints], np.eye(3)[axis], atol=1e-12),
+        "each link hanging on the one before, and all legs on one body": (
+            (model.body_parentid[bodies[:, 1:]] == bodies[:, :-1]).all()
+            and (model.body_parentid[bodies[:, 0]] == model.body_parentid[bodies[0, 0]]).all()
+        ),
+        "nothing else hanging on a leg": np.isin(np.flatnonzero(np.isin(model.body_parentid, bodies)), bodies).all(),
+    }
+    missing = [requirement for requirement, is_met in requirements.items() if not is_met]
+    if missing:
         raise ConfigurationError(
-            "every leg must be a chain of links with one hinge each, parallel to the pelvis at zero angles, with axes "
-            f"+x, +y or +z in the same order; joints: {', '.join(model.joint(j).name for j in joints.ravel())}"
+            f"legs must be chains with {'; '.join(missing)}; got the joints "
+            f"{', '.join(model.joint(j).name for j in joints.ravel())}"
         )
