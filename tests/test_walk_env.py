@@ -36,6 +36,7 @@ JOINTS = [f"{side}_{joint}" for side in "lr" for joint in
           ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")]  # fmt: skip
 GRAVITY, MASS_KG, FOOT_MASS_KG = 9.81, 57.0, 1.616
 STIFFNESS, FRICTION, COUNTS_PER_TURN = 1001.0, 5.4, 501_923
+SCENARIOS = ["nominal", "spread", "push", "slope", "sensor"]
 INFO_KEYS = {
     "time_s", "pelvis_roll", "pelvis_pitch", "pelvis_error", "pelvis_height", "zmp_x", "zmp_y", "zmp_reference_x",
     "zmp_reference_y", "zmp_deviation", "zmp_deviation_x", "zmp_deviation_y", "link_error", "link_error_lowest",
@@ -343,10 +344,12 @@ def spoil_arrays(result: Any) -> None:
             spoil_arrays(value)
 
 
-def test_a_deep_copy_goes_on_as_the_original() -> None:
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_a_deep_copy_goes_on_as_the_original(num_envs: int) -> None:
     """Catches copies whose arrays, springs or noise are no longer those of the physics."""
-    env = walk_env(scenario=HARD)
-    actions = random_actions(20, 1, size=0.05)[:, 0]
+    env = walk_worlds(num_envs, scenario=HARD)
+    env.reset(seed=0)
+    actions = random_actions(20, num_envs, size=0.05)
     for action in actions:
         env.step(action)
     twin = copy.deepcopy(env)
@@ -357,8 +360,25 @@ def test_a_deep_copy_goes_on_as_the_original() -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Many worlds
+# One world and many
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(scenario: str) -> None:
+    """Catches a world whose noise, robot or physics depends on its neighbours or on who computes it."""
+    actions = random_actions(15, 7, seed=2)
+    logs = {}
+    for num_envs, num_threads in [(7, 1), (7, 2), (1, 1)]:
+        env = walk_worlds(num_envs, num_threads=num_threads, scenario=scenario)
+        log = [env.reset(seed=100)[0]]
+        log += [env.step(action[:num_envs])[0] for action in actions]
+        logs[num_envs, num_threads] = np.array(log)
+    np.testing.assert_array_equal(logs[7, 2], logs[7, 1])
+    np.testing.assert_array_equal(logs[1, 1], logs[7, 1][:, :1])
+    for world in (0, 6):
+        scalar = record(make_walk(**SHORT, scenario=scenario), 100 + world, actions[:, world])
+        np.testing.assert_array_equal(scalar.observations, logs[7, 1][:, world])
 
 
 def test_one_seed_per_world_or_an_error() -> None:
