@@ -5,6 +5,7 @@ policy = baselines.make("input", env)
 action, state = policy.predict(observation)
 """
 
+import elastic_env  # noqa: F401  first: it chooses MuJoCo's OpenGL before anything imports MuJoCo
 from baselines.compensated import Compensated
 from baselines.compensators import DynamicCompensator, GravityCompensator
 from baselines.policies import make, policy_names
