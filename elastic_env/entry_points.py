@@ -25,6 +25,8 @@ from elastic_env.walking.gait import Gait, make_gait
 
 ConfigT = TypeVar("ConfigT")
 
+_GAIT = ("lift_m", "hip_height_m", "transfer")
+
 
 def configure_testbed(
     reference: str | dict[str, Any] | AnyReference = "hold",
@@ -95,7 +97,10 @@ def configure_walk(
         if not isinstance(given, dict | model | None):
             raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
     if not isinstance(gait, dict | None):
-        raise ConfigurationError(f"gait must be a mapping of parameters of Gait, got {gait!r}; see also step_period")
+        raise ConfigurationError(f"gait must be a mapping of {', '.join(_GAIT)}, got {gait!r}; see also step_period")
+    for name in gait or {}:
+        if name not in _GAIT:
+            raise unknown_name("parameter of gait beside step_period and num_steps", name, _GAIT)
     chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
     if isinstance(joint, ElasticJoint):
         joints = dict.fromkeys(chosen.joints, joint)

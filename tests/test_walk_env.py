@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.spatial.transform import Rotation
 
 import elastic_env  # noqa: F401  registers the environments
@@ -113,6 +113,15 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
         np.testing.assert_array_equal(a, b, err_msg=path)
 
 
+def row_of(results: Any, world: int) -> Any:
+    """What nested results say of one world, without Gymnasium's masks, as the scalar environment says it."""
+    if isinstance(results, dict):
+        return {key: row_of(value, world) for key, value in results.items() if not key.startswith("_")}
+    if isinstance(results, tuple):
+        return tuple(row_of(value, world) for value in results)
+    return results[world]
+
+
 @dataclass
 class Recording:
     """An episode of one world step by step, row 0 the reset, and the truth beside it."""
@@ -166,7 +175,8 @@ def record(env: ElasticEnv, seed: int, actions: Array) -> Recording:
 
 HARD = "spread+push+sensor"
 """All that can be drawn: stiffness, push, biases; and a delay."""
-HARD_ACTIONS = random_actions(NUM_STEPS, 1, seed=1)[:, 0]
+HARD_SEED = 20
+HARD_ACTIONS = random_actions(NUM_STEPS, 2, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +184,7 @@ def hard_walk() -> Recording:
     """A whole episode under a hard scenario with restless commands."""
     env = make_walk(**SHORT, scenario=HARD)
     record(env, 3, random_actions(30, 1)[:, 0])  # left half-way: must not show in the next
-    return record(env, 21, HARD_ACTIONS)
+    return record(env, HARD_SEED + 1, HARD_ACTIONS[:, 1])
 
 
 @pytest.fixture(scope="module")
@@ -364,6 +374,22 @@ def test_a_deep_copy_goes_on_as_the_original(num_envs: int) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def test_a_world_of_the_vector_is_the_scalar_environment_for_a_whole_episode(hard_walk: Recording) -> None:
+    """Catches any rule that one of the faces has and the other has not, to the last bit, end and metrics included."""
+    env = walk_worlds(2, scenario=HARD, autoreset_mode=AutoresetMode.SAME_STEP)
+    log = [env.reset(seed=HARD_SEED)]
+    log += [env.step(actions) for actions in HARD_ACTIONS]
+    assert len(hard_walk.results) == len(log)
+    for result, expected in zip(log[:-1], hard_walk.results[:-1], strict=True):
+        assert_equal(row_of(result, 1), expected)
+    *end, info = log[-1]
+    *expected, expected_info = hard_walk.results[-1]
+    assert_equal([part[1] for part in end[1:]], expected[1:])
+    np.testing.assert_array_equal(info["final_obs"][1], expected[0])
+    assert_equal(row_of(info["final_info"], 1), expected_info)
+    assert info["time_s"][1] == 0.0  # begun anew
+
+
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(scenario: str) -> None:
     """Catches a world whose noise, robot or physics depends on its neighbours or on who computes it."""
@@ -379,6 +405,70 @@ def test_results_depend_neither_on_threads_nor_on_the_number_of_worlds(scenario:
     for world in (0, 6):
         scalar = record(make_walk(**SHORT, scenario=scenario), 100 + world, actions[:, world])
         np.testing.assert_array_equal(scalar.observations, logs[7, 1][:, world])
+
+
+class Pair:
+    """The vector environment beside Gymnasium's own vectorisation of the scalar one."""
+
+    def __init__(self, num_envs: int, mode: AutoresetMode, **arguments: Any) -> None:
+        self.many = walk_worlds(num_envs, autoreset_mode=mode, **arguments)
+        self.single = SyncVectorEnv([lambda: make_walk(**SHORT, **arguments)] * num_envs, autoreset_mode=mode)
+
+    def reset(self, **arguments: Any) -> None:
+        """Reset both and compare."""
+        expected, result = self.single.reset(**copy.deepcopy(arguments)), self.many.reset(**arguments)
+        np.testing.assert_array_equal(result[0], expected[0])
+        assert_info_of_rows(result[1], expected[1])
+
+    def step(self, actions: Array) -> tuple[Any, ...]:
+        """Step both and compare, exactly."""
+        expected, result = self.single.step(actions), self.many.step(actions)
+        for part, (result_part, wanted) in enumerate(zip(result[:4], expected[:4], strict=True)):
+            np.testing.assert_array_equal(result_part, wanted, err_msg=f"part {part} of the result")
+        assert_info_of_rows(result[4], expected[4])
+        return result
+
+    def disturb(self, world: int, roll: float = 0.0, value: float = 0.0) -> None:
+        """Turn a robot over, or put a bad number, into the same world of both."""
+        for env, at in ((self.many, world), (self.single.envs[world], 0)):
+            if roll:
+                lean(env, roll=roll, world=at)
+            else:
+                break_world(env, at, value)
+
+
+def assert_info_of_rows(info: dict[str, Any], expected: dict[str, Any], path: str = "info") -> None:
+    """Everything that the scalar environments say stands in the vector's info, in the row of the same world."""
+    for key, values in expected.items():
+        if key.startswith("_"):
+            continue
+        assert key in info, f"{path}[{key!r}] is missing"
+        if isinstance(values, dict):
+            assert_info_of_rows(info[key], values, f"{path}[{key!r}]")
+            continue
+        for row in np.flatnonzero(expected[f"_{key}"]):
+            np.testing.assert_array_equal(info[key][row], values[row], err_msg=f"{path}[{key!r}][{row}]")
+        if f"_{key}" in info:
+            np.testing.assert_array_equal(info[f"_{key}"], expected[f"_{key}"], err_msg=f"{path}['_{key}']")
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("scenario", [*SCENARIOS, HARD])
+def test_worlds_that_end_at_different_times_keep_apart(scenario: str, mode: AutoresetMode) -> None:
+    """Catches an end in one world that shows in the results of another: masks of reset, fall and divergence."""
+    pair = Pair(3, mode, scenario=scenario)
+    pair.reset(seed=11)
+    ends: list[str] = []
+    for k, actions in enumerate(random_actions(16, 3, seed=5)):
+        if k == 3:
+            pair.reset(seed=[None, 5, None], options={"reset_mask": np.array([False, True, False])})
+        if k == 5:
+            pair.disturb(1, roll=0.6)
+        if k in (6, 9):
+            pair.disturb(2, value=np.nan if k == 6 else 1e12)
+        info = pair.step(actions)[4]
+        ends += [str(reason) for reason in info.get("final_info", info)["termination"] if reason]
+    assert ends == ["fell", "diverged", "diverged"]
 
 
 def test_one_seed_per_world_or_an_error() -> None:
@@ -522,7 +612,9 @@ def test_columns_are_constant_only_where_the_walk_has_nothing_to_say(hard_walk: 
 def test_the_last_command_is_reference_plus_offset(hard_walk: Recording) -> None:
     """Catches the command of another step, or one that knows of the homing error."""
     plan = hard_walk.env.task.assumed_model.plan
-    np.testing.assert_allclose(hard_walk.group("last_command")[1:], plan.q[1:] + HARD_ACTIONS, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        hard_walk.group("last_command")[1:], plan.q[1:] + HARD_ACTIONS[:, 1], rtol=0.0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(("roll", "pitch"), [(0.1, 0.0), (-0.2, 0.0), (0.0, 0.15), (0.0, -0.05), (0.1, -0.1)])
@@ -813,7 +905,7 @@ def test_info_holds_the_documented_keys_and_they_agree_with_the_truth(hard_walk:
     plan = hard_walk.env.task.assumed_model.plan
     q, theta, stiffness = (hard_walk.truth(name)[1:] for name in ("q", "theta", "stiffness"))
     slip = (hard_walk.truth("theta_dot") - hard_walk.truth("q_dot"))[1:]
-    error, offsets = plan.q[1:] - q, HARD_ACTIONS.astype(np.float64)
+    error, offsets = plan.q[1:] - q, HARD_ACTIONS[:, 1].astype(np.float64)
     zmp = np.stack([hard_walk.info("zmp_x"), hard_walk.info("zmp_y")], axis=1)
 
     def rms(values: Array) -> Array:
@@ -1182,9 +1274,12 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         ({"num_steps": 0}, r"Gait\.num_steps must be a whole number >= 1, got 0"),
         ({"num_steps": 1.5}, r"Gait\.num_steps must be a whole number >= 1, got 1\.5"),
         ({"gait": {"hip_height_m": 0.75}}, r"foot is out of reach at 0\.000 s: 0\.6500 m.*at most 0\.6 m; lower hip_h"),
-        ({"gait": {"lift": 0.1}}, r"unknown parameter of Gait 'lift'; choose one of: .*Did you mean 'lift_m'"),
+        (
+            {"gait": {"lift": 0.1}},
+            r"unknown parameter of gait beside step_period and num_steps 'lift'; choose one of: .*Did you mean 'lift_m'",
+        ),
         ({"gait": {"lift_m": 0.5}}, r"too much of joint 'r_\w+' at .* s: it allows .* rad, the plan needs .* rad; use"),
-        ({"gait": 3.0}, r"gait must be a mapping of parameters of Gait, got 3\.0; see also step_period"),
+        ({"gait": 3.0}, r"gait must be a mapping of lift_m, hip_height_m, transfer, got 3\.0; see also step_period"),
         ({"robot": {"hip": 1}}, r"unknown parameter of Thormang 'hip'; choose one of: hip_half_spacing, twin_knee"),
         ({"robot": {"friction": -1.0}}, r"Thormang\.friction must be a finite number > 0, got -1"),
         ({"robot": "mk1"}, r"robot must be a Thormang or a mapping of its parameters, got 'mk1'"),

@@ -127,7 +127,10 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
     if isinstance(value, list | tuple | np.ndarray):
-        return np.asarray(value, dtype=np.float64)
+        try:
+            return np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {value!r}") from None
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {value!r}")
     try:

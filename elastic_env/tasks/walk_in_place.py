@@ -54,7 +54,7 @@ from elastic_env.walking.ground_contact import ground_wrench, zero_moment_point
 from elastic_env.walking.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 
 UNLOADED_SHARE = 0.05
-"""Share of the weight below which a foot, or both together, count as unloaded."""
+"""Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
 
 def tilt_penalty(pelvis_error: Array) -> Array:
@@ -98,6 +98,8 @@ class WalkTask:
         self._torso = self.model.body("upper_body").id
         self._gravity = self.model.opt.gravity.copy()
         self._weight = float(self.model.body_mass.sum()) * robot.gravity
+        # sensors that carry nothing stand for a ground that carries the feet
+        self._least_force = UNLOADED_SHARE * self._weight + float(self._foot_mass.sum()) * robot.gravity
         n, m = num_worlds, len(LEG_JOINTS)
         self._step = np.zeros(n, dtype=np.int64)
         self._draw = np.zeros(n, dtype=np.int64)
@@ -304,17 +306,18 @@ class WalkTask:
         """The true state of some worlds; the others keep their last one."""
         at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
         sensors = -simulation.bind("sensordata").reshape(-1, 2, 2, 3)  # MuJoCo's act on the foot, ours on the leg
-        foot_R = simulation.bind("site_xmat")[:, self._sites].reshape(-1, 2, 3, 3)
-        ankles = simulation.bind("site_xpos")[:, self._sites]
+        foot_R = np.take(simulation.bind("site_xmat"), self._sites, axis=1).reshape(-1, 2, 3, 3)
+        ankles = np.take(simulation.bind("site_xpos"), self._sites, axis=1)
         force, moment = ground_wrench(
             sensors[:, :, 0], sensors[:, :, 1], foot_R, self._foot_mass, self._foot_com, self._gravity
         )
         pelvis_R = rotation_of(qpos[:, 3:7])
         fresh = WalkState(
-            theta=qpos[:, at.theta],
-            theta_dot=qvel[:, at.theta_dot],
-            q=qpos[:, at.q],
-            q_dot=qvel[:, at.q_dot],
+            # take, not an index: the memory order of its result does not depend on the number of worlds
+            theta=np.take(qpos, at.theta, axis=1),
+            theta_dot=np.take(qvel, at.theta_dot, axis=1),
+            q=np.take(qpos, at.q, axis=1),
+            q_dot=np.take(qvel, at.q_dot, axis=1),
             pelvis=qpos[:, :3].copy(),
             pelvis_R=pelvis_R,
             attitude=attitude_of(pelvis_R),
@@ -322,7 +325,7 @@ class WalkTask:
             ankles=ankles,
             wrench=sensors.reshape(-1, 12),
             force=force[..., 2],
-            zmp=zero_moment_point(force, moment, ankles, UNLOADED_SHARE * self._weight),
+            zmp=zero_moment_point(force, moment, ankles, self._least_force),
             servo_torque=simulation.bind("actuator_force").copy(),
         )
         self._state = fresh if worlds.all() else self._state.with_worlds(worlds, fresh)
