@@ -33,7 +33,8 @@ from elastic_env.tasks.testbed import METRICS
 from tests.test_identification import synthetic
 from train.cli import main
 from train.compare import CompareConfig
-from train.evaluate import Condition, Evaluation, PolicySpec, evaluate
+from train.conditions import Condition, PolicySpec
+from train.evaluate import Evaluation, evaluate
 from train.play import play
 from train.runs import new_run, run_folder
 

@@ -24,7 +24,8 @@ from elastic_env.walking.gait import LEFT, RIGHT
 from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
 from train.cli import main
 from train.compare import CompareConfig, try_out
-from train.evaluate import Condition, Evaluation, PolicySpec, evaluate, make_vector_env
+from train.conditions import Condition, PolicySpec
+from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
 from train.summary import print_summary, summary_table, write_summary
 from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
