@@ -85,7 +85,7 @@ class Evaluate:
     def run(self) -> None:
         """Evaluate as a comparison of one cell."""
         from train.compare import CompareConfig, compare
-        from train.evaluate import PolicySpec
+        from train.conditions import PolicySpec
 
         options = {} if self.stiffness is None else {"stiffness": _number_or_path(self.stiffness)}
         config = CompareConfig(
@@ -179,7 +179,7 @@ class Play:
 
     def run(self) -> None:
         """Play."""
-        from train.evaluate import Condition, PolicySpec
+        from train.conditions import Condition, PolicySpec
         from train.play import play
 
         reference = "sine" if self.reference is None and self.env == "testbed" else self.reference

@@ -11,8 +11,9 @@ from rich.console import Console
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from train import plots
+from train.conditions import Condition, Motion, PolicySpec
 from train.environments import Environment, Reference, environment
-from train.evaluate import Condition, Evaluation, Motion, PolicySpec, make_policy, make_vector_env
+from train.evaluate import Evaluation, make_policy, make_vector_env
 from train.figures import draw_figures
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary

@@ -12,7 +12,8 @@ import baselines.identification as identification
 from baselines.gravity_torque import make_gravity
 from train import plots
 from train.compare import CompareConfig
-from train.evaluate import Evaluation, PolicySpec, make_vector_env
+from train.conditions import PolicySpec
+from train.evaluate import Evaluation, make_vector_env
 from train.figures import cells, draw_figure
 from train.runs import run_folder
 from train.summary import print_summary

@@ -3,112 +3,24 @@
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from pydantic import AfterValidator, field_validator
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.static_points import HoldRecorder, StaticPoints
-from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
-from train.environments import ENVIRONMENTS, RESERVED, Environment, Reference, environment
+from train.conditions import Condition, PolicySpec
 from train.support_changes import SupportChanges
 
 _MAX_WORLDS = 64
 
 Progress = Callable[[int], None]
-
-
-def _options(value: dict[str, Any]) -> dict[str, Any]:
-    motions = {known.motion for known in ENVIRONMENTS.values()}
-    taken = sorted(value.keys() & {*RESERVED, *motions})
-    if taken:
-        raise ValueError(f"{', '.join(taken)} cannot be given here but have keys of their own, or no place")
-    return value
-
-
-def _reference(value: Any) -> Reference:
-    if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
-        raise ValueError(
-            f"a reference is a name, a step period [s], three durations [s] or a mapping of parameters, got {value!r}"
-        )
-    taken = sorted(value.keys() & set(RESERVED)) if isinstance(value, dict) else []
-    if taken:
-        raise ValueError(f"{', '.join(taken)} cannot be part of a reference but have keys of their own, or no place")
-    return list(value) if isinstance(value, tuple) else value
-
-
-Motion = Annotated[Any, AfterValidator(_reference)]
-"""A `Reference`, checked when it is read."""
-
-
-class PolicySpec(Model):
-    """A policy of a comparison: a baseline's name, or "module:function" for one's own, with options."""
-
-    name: str
-    label: str | None = None
-    """How tables and figures call it; None for its name."""
-    options: dict[str, Any] = {}
-    """Keyword arguments of `baselines.make`, or of one's own function."""
-    env_options: dict[str, Any] = {}
-    """Arguments of the environment for this policy alone, such as form: rigid."""
-    level: bool = False
-    """In a sweep: whether it plays once without the swept option, as a level to compare with."""
-
-    _checked = field_validator("env_options")(_options)
-
-    @property
-    def title(self) -> str:
-        """Label, or name."""
-        return self.label or self.name
-
-
-class Condition(Model):
-    """One cell of a comparison: who plays what under which scenario."""
-
-    env: str = "testbed"
-    policy: PolicySpec
-    reference: Motion = "hold"
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
-    or a mapping with `step_period` and further arguments of the environment."""
-    label: str | None = None
-    """How tables and figures call the reference; None for what the environment calls it."""
-    scenario: str = "nominal"
-    env_options: dict[str, Any] = {}
-    """Further arguments of the environment, such as stiffness."""
-    swept: dict[str, float] = {}
-    """The policy's option that a sweep varies, and its value here."""
-    episodes: int = quantity("1", 1, ge=1, description="number of episodes")
-    seed: int = quantity("1", 0, ge=0, description="seed of the first episode; the next ones follow")
-
-    _checked = field_validator("env_options")(_options)
-
-    @property
-    def environment(self) -> Environment:
-        """What is known of the environment."""
-        return environment(self.env)
-
-    @property
-    def reference_name(self) -> str:
-        """Label of the reference, or what the environment calls it."""
-        return self.label or self.environment.label(self.reference)
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Arguments of the environment; what the policy says goes before, and what the reference says before that."""
-        motion = self.environment.arguments(self.reference)
-        return {"scenario": self.scenario, **self.env_options, **self.policy.env_options, **motion}
-
-    @property
-    def policy_options(self) -> dict[str, Any]:
-        """Options of the policy with the swept one."""
-        return {**self.policy.options, **self.swept}
 
 
 @dataclass

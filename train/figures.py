@@ -9,15 +9,12 @@ from train.evaluate import Evaluation, make_vector_env
 from train.plots import draw_overview
 from train.sweep_plots import Curve, draw_sweep
 from train.testbed_plots import draw_static_errors, draw_time_series
-from train.walk_plots import draw_pelvis, draw_zmp
+from train.walk_plots import draw_pelvis, draw_zmp, paper_figure
 
 Draw = Callable[[Sequence[Evaluation], Path], Path]
 
 MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
-
-_PAPER_FIGURES = {("pelvis", "24 s"): 7, ("pelvis", "3 s"): 8, ("zmp", "24 s"): 9, ("zmp", "3 s"): 10}
-_PAPER_SCENARIOS = ("ideal", "nominal")
 
 
 def draw_figures(
@@ -59,10 +56,8 @@ def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> l
 
 def figure_name(name: str, evaluation: Evaluation) -> str:
     """Name of a figure's file; the paper's conditions have the number of its figure in front."""
-    condition = evaluation.condition
-    number = _PAPER_FIGURES.get((name, condition.reference_name))
-    prefix = f"fig{number}_" if number is not None and condition.scenario in _PAPER_SCENARIOS else ""
-    return f"{prefix}{name}_{_stem(evaluation)}"
+    number = paper_figure(name, evaluation.condition)
+    return f"{'' if number is None else f'fig{number}_'}{name}_{_stem(evaluation)}"
 
 
 def cells(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:

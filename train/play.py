@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.progress import track
 
 from elastic_env.errors import ElasticError, ResultsExistError, missing_extra
-from train.evaluate import Condition, make_policy
+from train.conditions import Condition
+from train.evaluate import make_policy
 
 _FRAMES_PER_S = 25
 

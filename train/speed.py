@@ -18,8 +18,9 @@ from rich.table import Table
 
 from elastic_env.config import Model, quantity
 from elastic_env.signals import Array
+from train.conditions import Condition, PolicySpec
 from train.environments import environment
-from train.evaluate import Condition, PolicySpec, make_policy, make_vector_env
+from train.evaluate import make_policy, make_vector_env
 from train.runs import run_folder
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.signals import Array
+from train.conditions import Condition
 from train.evaluate import Evaluation
 from train.plots import FAILED, MM, MRAD, colour, columns_of, line_style, require_matplotlib, save
 
@@ -19,16 +20,17 @@ _BEFORE_FALL_S = 0.6
 _PAPER_BOUND_MRAD = 10.0
 """What the pelvis error stays below with compensation in the paper, in its two gaits."""
 _PAPER_LABEL = "paper, compensated: ±10 mrad"
-_PAPER_GAITS = ("24 s", "3 s")
+_PAPER_FIGURES = {("pelvis", "24 s"): 7, ("pelvis", "3 s"): 8, ("zmp", "24 s"): 9, ("zmp", "3 s"): 10}
+_PAPER_SCENARIOS = ("ideal", "nominal")
 
 
 def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Roll and pitch of the pelvis, which should be level, one line per policy."""
-    figure, axes = _panels(evaluations, "Pelvis error")
+    figure, axes = _panels(evaluations, "pelvis", "Pelvis error")
     for axis, signal, name in zip(axes, ("pelvis_roll", "pelvis_pitch"), ("roll", "pitch"), strict=True):
         axis.axhline(0.0, color="#777777", lw=0.8)
         _draw_lines(axis, evaluations, signal, MRAD)
-        if evaluations[0].condition.reference_name in _PAPER_GAITS:
+        if paper_figure("pelvis", evaluations[0].condition) is not None:
             for bound in (-_PAPER_BOUND_MRAD, _PAPER_BOUND_MRAD):
                 axis.axhline(bound, color="#777777", lw=0.9, ls=":", label=_PAPER_LABEL)
             low, high = axis.get_ylim()
@@ -39,7 +41,7 @@ def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Zero moment point, forward and to the left, with its reference, one line per policy."""
-    figure, axes = _panels(evaluations, "Zero moment point", height_ratios=(1.0, 1.5))
+    figure, axes = _panels(evaluations, "zmp", "Zero moment point", height_ratios=(1.0, 1.5))
     trace = _longest(evaluations)
     for axis, along, name in zip(axes, "xy", ("x, forward", "y, to the left"), strict=True):
         _draw_lines(axis, evaluations, f"zmp_{along}", MM, f"zmp_reference_{along}")
@@ -49,19 +51,30 @@ def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
     return _finish(figure, axes, evaluations, path)
 
 
+def paper_figure(name: str, condition: Condition) -> int | None:
+    """Number of the paper's figure that a picture of a condition stands beside, if there is one."""
+    is_like_the_paper = condition.scenario in _PAPER_SCENARIOS
+    return _PAPER_FIGURES.get((name, condition.reference_name)) if is_like_the_paper else None
+
+
 def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
     """Beginnings and ends of the times in which a mask is true, (n,) each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0.0], mask > 0.5, [0.0]])))
     return [(float(time[begin]), float(time[end - 1])) for begin, end in edges.reshape(-1, 2)]
 
 
-def _panels(evaluations: Sequence[Evaluation], what: str, height_ratios: tuple[float, float] = (1.0, 1.0)) -> Any:
+def _panels(
+    evaluations: Sequence[Evaluation], name: str, what: str, height_ratios: tuple[float, float] = (1.0, 1.0)
+) -> Any:
     plt = require_matplotlib()
     figure, axes = plt.subplots(
         2, 1, figsize=(9.0, 5.2), sharex=True, height_ratios=height_ratios, layout="constrained"
     )
     condition, trace = evaluations[0].condition, _longest(evaluations)
-    axes[0].set_title(f"{what}, {condition.environment.title(condition.reference_name)}, scenario {condition.scenario}")
+    number = paper_figure(name, condition)
+    beside = "" if number is None else f" (Fig. {number} of the paper)"
+    reference = condition.environment.title(condition.reference_name)
+    axes[0].set_title(f"{what}, {reference}, scenario {condition.scenario}{beside}")
     for axis in axes:
         for begin, end in intervals(trace["single_support"], trace["time_s"]):
             axis.axvspan(begin, end, color=_SHADE, lw=0, zorder=0, label="single support")

@@ -11,7 +11,8 @@ from multiprocessing.managers import SyncManager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from train.evaluate import Condition, Evaluation, evaluate, num_steps
+from train.conditions import Condition
+from train.evaluate import Evaluation, evaluate, num_steps
 
 
 def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
