@@ -12,7 +12,7 @@ contact point is, and what of the robot has mass, is chosen by name:
 In single support over its foot, `com` is the exact multibody torque.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -102,7 +102,7 @@ class BoundContactGravity:
         frames = self._frames.at(q)
         if self._legs_weigh:
             return frames
-        return LegFrames(frames.axes, frames.anchors, np.zeros_like(frames.levers), frames.foot_R, frames.com)
+        return replace(frames, moments=np.zeros_like(frames.moments), carried=np.zeros_like(frames.carried))
 
     def _points(self, frames: LegFrames) -> Array:
         return frames.ankle + rotated(frames.foot_R, self._in_sole)
@@ -151,12 +151,12 @@ class BoundWrenchTorque:
         frames = self._frames.at(q)
         force, moment = self._force_and_moment(frames)
         # the weight of the leg: the Hessian of a potential
-        legs = holding_torque_gradient(frames, self._gravity, np.zeros_like(force), frames.ankle)
+        legs = holding_torque_gradient(frames, self._gravity)
         # the wrench: a joint beyond i turns foot, force and moment under joint i; one before i turns all together
-        arm = frames.ankle[..., None, :] - frames.anchors
-        turned = cross(cross(frames.axes, arm), force[..., None, :]) + cross(frames.axes, moment[..., None, :])
+        turned_arm = cross(frames.axes, frames.ankle[..., None, :] - frames.anchors)
+        turned = cross(turned_arm, force[..., None, :]) + cross(frames.axes, moment[..., None, :])
         load = frames.axes @ turned.swapaxes(-1, -2)
-        load += cross(frames.axes, arm) @ cross(frames.axes, force[..., None, :]).swapaxes(-1, -2)
+        load += turned_arm @ cross(frames.axes, force[..., None, :]).swapaxes(-1, -2)
         return legs - np.triu(load, 1)
 
     def _force_and_moment(self, frames: LegFrames) -> tuple[Array, Array]:

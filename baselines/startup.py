@@ -37,6 +37,8 @@ class Ramp:
 
     def share(self, steps: Array) -> Array:
         """Share after a number of control steps, elementwise."""
+        if self.is_over(steps).all():
+            return np.ones_like(steps)
         time, each = steps * self._period_s, self._duration - self._delay
         return 0.5 * (quintic(time / each)[0] + quintic((time - self._delay) / each)[0])
 

@@ -118,7 +118,7 @@ class WalkingController:
         memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
         steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
         steps = steps + 1.0
-        share, _, _ = quintic(steps / self._ramp_steps)
+        share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else quintic(steps / self._ramp_steps)[0]
         row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
         z = self._leg_difference(rows, row, z)
         coms = frame.com_from_soles[..., :2]

@@ -322,16 +322,14 @@ def test_a_leg_that_the_formulas_do_not_cover_is_refused(change: Callable[[mujoc
     spec = spider_spec()
     LegChains(spec.compile(), SPIDER)
     change(spec)
-    with pytest.raises(
-        ConfigurationError, match=r"every leg must be a chain of links with one hinge each.*leg0_joint0"
-    ):
+    with pytest.raises(ConfigurationError, match=r"legs must be chains with .*leg0_joint0"):
         LegChains(spec.compile(), SPIDER)
 
 
 @pytest.mark.parametrize("order", [[0, 2, 1, 3], [0, 1, 3]])
 def test_joints_that_do_not_follow_one_another_are_refused(order: list[int]) -> None:
     """Catches joints named in another order than they are chained, and a joint that is left out."""
-    with pytest.raises(ConfigurationError, match="every leg must be a chain"):
+    with pytest.raises(ConfigurationError, match="legs must be chains"):
         LegChains(SPIDER_MODEL, [[leg[j] for j in order] for leg in SPIDER])
 
 

@@ -17,7 +17,7 @@ It is symmetric, the Hessian of a potential. Legs do not couple: the pelvis' ori
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import mujoco
 import numpy as np
@@ -33,16 +33,24 @@ class LegFrames:
     Attributes:
         axes: Joint axes z_i, (..., L, J, 3).
         anchors: A point on each axis, a_i, (..., L, J, 3) [m].
-        levers: s_i − m_i a_i of what the joint carries, (..., L, J, 3) [kg·m].
+        moments: First moments m c of the joints' own links, (..., L, J, 3) [kg·m].
+        carried: Mass that each joint carries, (L, J) [kg].
         foot_R: Orientation of the foot, (..., L, 3, 3).
         com: Center of mass of the whole robot, (..., 3) [m].
     """
 
     axes: Array
     anchors: Array
-    levers: Array
+    moments: Array
+    carried: Array
     foot_R: Array
     com: Array
+
+    @cached_property
+    def levers(self) -> Array:
+        """s_i − m_i a_i of all that a joint carries, (..., L, J, 3) [kg·m]."""
+        beyond = np.cumsum(self.moments[..., ::-1, :], axis=-2)[..., ::-1, :]
+        return beyond - self.carried[..., None] * self.anchors
 
     @property
     def ankle(self) -> Array:
@@ -108,14 +116,14 @@ class LegChains:
         per_leg = (*[1] * len(shape), -1)  # against (..., L) of a joint and component
         ipos = self._ipos.T.reshape(3, J, *per_leg)
         coms = anchors + links[:, 0] * ipos[0] + links[:, 1] * ipos[1] + links[:, 2] * ipos[2]
-        mass, below = self._mass.T.reshape(J, *per_leg), self._carried.T.reshape(J, *per_leg)
-        carried = np.cumsum((mass * coms)[::-1], axis=0)[::-1]
-        legs = carried[0].sum(axis=-1)
+        moments = self._mass.T.reshape(J, *per_leg) * coms
+        legs = moments.sum(axis=0).sum(axis=-1)
         com = (self._trunk_moment + legs.transpose(*range(1, legs.ndim), 0)) / self.mass
         return LegFrames(
             axes=_vectors_last(axes),
             anchors=_vectors_last(anchors),
-            levers=_vectors_last(carried - below * anchors),
+            moments=_vectors_last(moments),
+            carried=self._carried,
             foot_R=columns.transpose(*range(2, columns.ndim), 1, 0),
             com=com,
         )
@@ -150,10 +158,16 @@ def holding_torque(frames: LegFrames, gravity: Array, force: Array, point: Array
     return -dot(frames.axes, load)
 
 
-def holding_torque_gradient(frames: LegFrames, gravity: Array, force: Array, point: Array) -> Array:
-    """∂τ/∂q of `holding_torque` with the force fixed in space and its point fixed in the foot, (..., L, J, J)."""
+def holding_torque_gradient(
+    frames: LegFrames, gravity: Array, force: Array | None = None, point: Array | None = None
+) -> Array:
+    """∂τ/∂q of `holding_torque` with the force fixed in space and its point fixed in the foot, (..., L, J, J).
+
+    Without force and point it is that of the legs' weight.
+    """
     turned = cross(cross(frames.axes, frames.levers), gravity[..., None, None, :])
-    turned += cross(cross(frames.axes, point[..., None, :] - frames.anchors), force[..., None, :])
+    if force is not None and point is not None:
+        turned += cross(cross(frames.axes, point[..., None, :] - frames.anchors), force[..., None, :])
     product = -(frames.axes @ turned.swapaxes(-1, -2))
     J = product.shape[-1]
     return product * _upper(J, 0) + (product * _upper(J, 1)).swapaxes(-1, -2)
