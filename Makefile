@@ -27,7 +27,7 @@ help: ## Show this text
 	@echo
 	@echo "The command line behind it: $(BIN)/elastic --help"
 
-demo: $(STAMP) ## The testbed end to end: identify the spring, compensate it, show table and figures
+demo: $(STAMP) ## Testbed and walker end to end: identify the spring, compensate it, show tables and figures
 	$(BIN)/elastic demo
 
 test: $(STAMP) ## Run the tests, without network or display

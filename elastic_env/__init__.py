@@ -1,7 +1,7 @@
-"""Gymnasium environments of robots with elastic joints: a single-actuator testbed.
+"""Gymnasium environments of robots with elastic joints: a single-actuator testbed and a humanoid walking in place.
 
 import gymnasium, elastic_env
-env = gymnasium.make("elastic_env/Testbed-v0", scenario="nominal")
+env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=3.0, scenario="nominal")
 """
 
 import gymnasium
