@@ -614,6 +614,7 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     printed = capsys.readouterr().out
     walks = {"pelvis_0.3+0.5+0.3_s_nominal.png", "zmp_0.3+0.5+0.3_s_nominal.png"}
     names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json", *walks}
+    names |= {"episodes.csv", "summary.md"}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}
     assert [name for name in names if f"runs/demo/{name}" not in printed] == []
     of_the_paper = ("Pearson r", "0.9775", "-56.2 to +41.7", "about 40", "below 10")

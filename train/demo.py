@@ -16,7 +16,7 @@ from train.conditions import PolicySpec
 from train.evaluate import Evaluation, make_vector_env
 from train.figures import cells, draw_figure
 from train.runs import run_folder
-from train.summary import print_summary
+from train.summary import print_summary, write_episodes, write_summary
 from train.testbed_plots import draw_identification, draw_static_errors, draw_time_series, static_errors
 from train.workers import run_conditions
 
@@ -69,6 +69,8 @@ def demo(console: Console, output: Path | None = None) -> None:
             draw_time_series(motion, folder / "sine.png"),
             *(file for name in ("pelvis", "zmp") for walk in cells(walks) for file in draw_figure(name, walk, folder)),
             folder / "identification.json",
+            write_episodes([*motion, *walks], folder / "episodes.csv"),
+            write_summary(walks, folder / "summary.md"),
         ]
     console.print(_testbed_table(result, static), "")
     print_summary(motion, console)
@@ -96,12 +98,10 @@ def _testbed_table(result: identification.Identification, static: Sequence[Evalu
 
 
 def _walk_table(walks: Sequence[Evaluation]) -> Table:
-    table = _beside_the_paper("the paper's walks in place, Figs. 7 and 8: largest error of the pelvis")
+    table = _beside_the_paper("the paper's walks, Figs. 7 and 8: largest roll and pitch")
     for walk in walks:
         condition = walk.condition
-        name = (
-            f"roll and pitch, {condition.environment.title(condition.reference_name)}, {condition.policy.title} [mrad]"
-        )
+        name = f"{condition.environment.title(condition.reference_name)}, {condition.policy.title} [mrad]"
         paper = _PAPER_PELVIS.get(condition.policy.title, "-")
         table.add_row(escape(name), "fell" if walk.num_failed else _pelvis_peaks(walk), paper)
     return table
