@@ -72,7 +72,7 @@ def _panels(
     )
     condition, trace = evaluations[0].condition, _longest(evaluations)
     number = paper_figure(name, condition)
-    beside = "" if number is None else f" (Fig. {number} of the paper)"
+    beside = "" if number is None else f" (cf. Fig. {number} of the paper)"
     reference = condition.environment.title(condition.reference_name)
     axes[0].set_title(f"{what}, {reference}, scenario {condition.scenario}{beside}")
     for axis in axes:
