@@ -71,7 +71,7 @@ class Environment:
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
         quantity: What a reference is, in titles; empty where its label says it.
-        failure: What an episode is called that ends before its time.
+        failure: Heading for episodes that end before their time.
     """
 
     id: str
@@ -89,7 +89,7 @@ class Environment:
     swept: tuple[Column, ...]
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     quantity: str = ""
-    failure: str = "failed"
+    failure: str = "fail"
 
     def title(self, reference_name: str) -> str:
         """A reference's name as it stands in titles."""

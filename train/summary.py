@@ -99,7 +99,7 @@ def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
     known = evaluations[0].condition.environment
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
     statistic = "Median over the episodes that did not fail" + (" (the worst of them in brackets)" if several else "")
-    head = f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; {known.failure} are counted beside."
+    head = f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; failures are counted beside."
     parts = [head, known.note, _markdown(evaluations, known.columns)]
     for title, columns in known.splits:
         parts += [f"{title}:", _markdown(evaluations, columns)]
