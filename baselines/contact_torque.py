@@ -12,24 +12,20 @@ contact point is, and what of the robot has mass, is chosen by name:
 In single support over its foot, `com` is the exact multibody torque.
 """
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
 from elastic_env.walking.contact_force import shares
-from elastic_env.walking.leg_chains import (
-    LegChains,
-    LegFrames,
-    cross,
-    holding_torque,
-    holding_torque_gradient,
-    rotated,
-)
+from elastic_env.walking.leg_chains import FootWrenches, LegChains, LegPosture, LegWeights
 
 ContactMethod = Literal["com", "ankle", "lumped"]
+
+_Statics = TypeVar("_Statics")
 
 _LEGS, _PER_LEG = 2, 6
 
@@ -78,16 +74,13 @@ class BoundContactGravity:
     """Gravity torque of a walker whose feet share the weight in a given way; a `GravityModel` on (num_worlds, 12)."""
 
     def __init__(self, model: WalkerModel, weights: Array, in_sole: Array, gravity: Array, legs_weigh: bool) -> None:
-        self._chains, self._weights, self._in_sole = model.biped.chains, weights, in_sole
-        self._gravity, self._legs_weigh = gravity, legs_weigh
-        self._force = -model.biped.chains.mass * weights[..., None] * np.expand_dims(np.atleast_2d(gravity), -2)
-        self._frames = _Memo(self._chains)
+        chains = model.biped.chains
+        lifted = -chains.mass * weights  # what the ground carries is a negative mass where it does
+        self._legs = _Memo(chains, lambda legs: LegWeights(legs, gravity, lifted, in_sole, legs_weigh))
 
     def gravity_torque(self, q: Array) -> Array:
         """See `GravityModel`."""
-        frames = self._weighing(q)
-        torque = holding_torque(frames, self._gravity, self._force, self._points(frames))
-        return torque.reshape(q.shape)
+        return self._legs.at(q).torque().reshape(q.shape)
 
     def gravity_gradient(self, q: Array) -> Array:
         """See `GravityModel`."""
@@ -95,17 +88,7 @@ class BoundContactGravity:
 
     def gradient_by_leg(self, q: Array) -> Array:
         """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        frames = self._weighing(q)
-        return holding_torque_gradient(frames, self._gravity, self._force, self._points(frames))
-
-    def _weighing(self, q: Array) -> LegFrames:
-        frames = self._frames.at(q)
-        if self._legs_weigh:
-            return frames
-        return replace(frames, moments=np.zeros_like(frames.moments), carried=np.zeros_like(frames.carried))
-
-    def _points(self, frames: LegFrames) -> Array:
-        return frames.ankle + rotated(frames.foot_R, self._in_sole)
+        return self._legs.at(q).gradient()
 
 
 class WrenchTorque:
@@ -132,15 +115,15 @@ class BoundWrenchTorque:
     """Joint torques under wrenches that are known in the frames of the feet; a `GravityModel` on (num_worlds, 12)."""
 
     def __init__(self, model: WalkerModel, wrench: Array, gravity: Array) -> None:
-        self._wrench, self._gravity = wrench, gravity
-        self._frames = _Memo(model.biped.chains_above_feet)
+        force, moment = wrench[..., 0, :], wrench[..., 1, :]
+        self._legs = _Memo(
+            model.biped.chains_above_feet, lambda legs: (LegWeights(legs, gravity), FootWrenches(legs, force, moment))
+        )
 
     def gravity_torque(self, q: Array) -> Array:
         """See `GravityModel`."""
-        frames = self._frames.at(q)
-        force, moment = self._force_and_moment(frames)
-        torque = holding_torque(frames, self._gravity, force, frames.ankle, moment)
-        return torque.reshape(q.shape)
+        weights, wrenches = self._legs.at(q)
+        return (weights.torque() + wrenches.torque()).reshape(q.shape)
 
     def gravity_gradient(self, q: Array) -> Array:
         """See `GravityModel`; not symmetric, since the wrench turns with its foot."""
@@ -148,20 +131,8 @@ class BoundWrenchTorque:
 
     def gradient_by_leg(self, q: Array) -> Array:
         """∂τ/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        frames = self._frames.at(q)
-        force, moment = self._force_and_moment(frames)
-        # the weight of the leg: the Hessian of a potential
-        legs = holding_torque_gradient(frames, self._gravity)
-        # the wrench: a joint beyond i turns foot, force and moment under joint i; one before i turns all together
-        turned_arm = cross(frames.axes, frames.ankle[..., None, :] - frames.anchors)
-        turned = cross(turned_arm, force[..., None, :]) + cross(frames.axes, moment[..., None, :])
-        load = frames.axes @ turned.swapaxes(-1, -2)
-        load += turned_arm @ cross(frames.axes, force[..., None, :]).swapaxes(-1, -2)
-        return legs - np.triu(load, 1)
-
-    def _force_and_moment(self, frames: LegFrames) -> tuple[Array, Array]:
-        """Of each foot on its leg in the frame of the pelvis, (num_worlds, 2, 3) each."""
-        return rotated(frames.foot_R, self._wrench[..., 0, :]), rotated(frames.foot_R, self._wrench[..., 1, :])
+        weights, wrenches = self._legs.at(q)
+        return weights.gradient() + wrenches.gradient()
 
 
 class PlannedTorque:
@@ -200,19 +171,19 @@ class BoundPlannedTorque:
         return self.torque + self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
 
 
-class _Memo:
-    """Frames of the last joint angles: torque and gradient are asked for at the same ones."""
+class _Memo(Generic[_Statics]):
+    """Statics of legs at the last joint angles: torque and gradient are asked for at the same ones."""
 
-    def __init__(self, chains: LegChains) -> None:
-        self._chains = chains
-        self._q: Array | None = None
-        self._frames: LegFrames | None = None
+    def __init__(self, chains: LegChains, make: Callable[[LegPosture], _Statics]) -> None:
+        self._chains, self._make = chains, make
+        self._last: tuple[Array, _Statics] | None = None
 
-    def at(self, q: Array) -> LegFrames:
-        """Frames at joint angles, (num_worlds, 12) [rad]."""
-        if self._frames is None or self._q is not q:
-            self._q, self._frames = q, self._chains.frames(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
-        return self._frames
+    def at(self, q: Array) -> _Statics:
+        """At joint angles, (num_worlds, 12) [rad]."""
+        if self._last is None or self._last[0] is not q:
+            posture = self._chains.posture(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
+            self._last = q, self._make(posture)
+        return self._last[1]
 
 
 def _block_diagonal(blocks: Array) -> Array:

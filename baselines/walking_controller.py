@@ -65,10 +65,9 @@ class LocalFrame:
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
     """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2) [rad]."""
-    frames = biped.chains.frames(q.reshape(len(q), 2, -1))
+    com, soles = biped.chains.com_and_feet(q.reshape(len(q), 2, -1), (0.0, 0.0, -biped.ankle_height))
     R = rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])
-    soles = frames.ankle - biped.ankle_height * frames.foot_R[..., 2]
-    return LocalFrame((R @ frames.com[..., None])[..., 0], soles @ R.swapaxes(-1, -2))
+    return LocalFrame((R @ com[..., None])[..., 0], soles @ R.swapaxes(-1, -2))
 
 
 class WalkingController:

@@ -12,15 +12,9 @@ from elastic_env.errors import ConfigurationError
 from elastic_env.rigid_body import FloatingBody
 from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped
 from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import (
-    LegChains,
-    LegFrames,
-    cross,
-    dot,
-    holding_torque,
-    holding_torque_gradient,
-    rotated,
-)
+from elastic_env.vectors import cross, rotated
+from elastic_env.walking.leg_chains import FootWrenches, LegChains, LegWeights
+from tests.legs import foot_frames, holding_torque
 
 ROBOT = biped(Thormang())
 AXES = (1, 0, 2, 1)  # y, x, z, y
@@ -92,9 +86,10 @@ class Posed:
         """Vectors of the world in the pelvis frame."""
         return vectors @ self.R
 
-    def point(self, frames: LegFrames) -> Array:
+    def point(self, chains: LegChains) -> Array:
         """The points fixed in the feet, in the pelvis frame."""
-        return frames.ankle + (frames.foot_R @ self.point_of_foot[..., None])[..., 0]
+        ankle, R = foot_frames(chains, self.q)
+        return ankle + (R @ self.point_of_foot[..., None])[..., 0]
 
     def torque(self, q: Array, moment: bool = False) -> Array:
         """Bias force of the rigid robot less JᵀF of forces that are fixed to the pelvis frame, (L, J)."""
@@ -112,20 +107,12 @@ class Posed:
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("seed", range(3))
-def test_frames_are_those_of_mujoco(name: str, seed: int) -> None:
-    """Catches a link that turns about the wrong axis or sense, and masses that are hung on the wrong joint."""
+def test_feet_are_where_mujoco_has_them(name: str, seed: int) -> None:
+    """Catches a link that turns about the wrong axis or sense, or whose offset is lost."""
     posed = Posed(name, seed)
-    frames = LegChains(posed.model, posed.legs).frames(posed.q)
-    data, bodies = posed.data, posed.model.jnt_bodyid[posed.joints]
-    np.testing.assert_allclose(frames.axes, posed.seen(data.xaxis[posed.joints]), rtol=0.0, atol=1e-12)
-    anchors = posed.seen(data.xanchor[posed.joints] - posed.pelvis)
-    np.testing.assert_allclose(frames.anchors, anchors, rtol=0.0, atol=1e-12)
-    np.testing.assert_array_equal(frames.ankle, frames.anchors[:, -1])
-    np.testing.assert_allclose(frames.foot_R, posed.R.T @ data.xmat[posed.feet].reshape(-1, 3, 3), atol=1e-12)
-    carried = posed.seen(data.subtree_com[bodies] - posed.pelvis) - anchors
-    levers = posed.model.body_subtreemass[bodies][..., None] * carried
-    np.testing.assert_allclose(frames.levers, levers, rtol=0.0, atol=1e-11)
-    assert np.abs(levers).max() > 0.5
+    ankle, R = foot_frames(LegChains(posed.model, posed.legs), posed.q)
+    np.testing.assert_allclose(ankle, posed.seen(posed.data.xpos[posed.feet] - posed.pelvis), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(R, posed.R.T @ posed.data.xmat[posed.feet].reshape(-1, 3, 3), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -134,7 +121,7 @@ def test_center_of_mass_is_that_of_mujoco_and_of_pinocchio(name: str) -> None:
     for seed in range(5):
         posed = Posed(name, seed)
         chains = LegChains(posed.model, posed.legs)
-        com = chains.frames(posed.q).com
+        com = chains.center_of_mass(posed.q)
         np.testing.assert_allclose(com, posed.seen(posed.data.subtree_com[0] - posed.pelvis), rtol=0.0, atol=1e-12)
         assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(posed.model), rel=1e-14)
         names = [joint for leg in posed.legs for joint in leg]
@@ -147,14 +134,13 @@ def test_holding_torque_is_the_bias_force_less_the_contact_forces(name: str) -> 
     """Catches a sign or lever of Eq. 4, a leg without its own weight, and a moment that is lost."""
     for seed in range(10):
         posed = Posed(name, seed)
-        frames = LegChains(posed.model, posed.legs).frames(posed.q)
-        point = posed.point(frames)
-        torque = holding_torque(frames, posed.gravity, posed.force, point)
+        chains = LegChains(posed.model, posed.legs)
+        torque = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains))
         np.testing.assert_allclose(torque, posed.torque(posed.q), rtol=0.0, atol=1e-9)
-        torque = holding_torque(frames, posed.gravity, posed.force, point, posed.moment)
+        torque = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains), posed.moment)
         np.testing.assert_allclose(torque, posed.torque(posed.q, moment=True), rtol=0.0, atol=1e-9)
-        unloaded = holding_torque(frames, posed.gravity, np.zeros_like(posed.force), point)
         bias = posed.data.qfrc_bias[posed.model.jnt_dofadr[posed.joints]]
+        unloaded = LegWeights(chains.posture(posed.q), posed.gravity).torque()
         np.testing.assert_allclose(unloaded, bias, rtol=0.0, atol=1e-9)
 
 
@@ -163,14 +149,29 @@ def test_holding_torque_is_that_of_pinocchio() -> None:
     q = np.random.default_rng(3).uniform(-1.0, 1.0, (20, 12))
     still, rest = np.zeros((20, 3)), np.zeros((20, 12))
     _, expected = FloatingBody(ROBOT.rigid, LEG_JOINTS).inverse_dynamics(q, still, rest, still, rest)
-    frames = ROBOT.chains.frames(q.reshape(20, 2, 6))
-    torque = holding_torque(frames, ROBOT.rigid.opt.gravity, np.zeros((20, 2, 3)), frames.ankle)
+    torque = LegWeights(ROBOT.chains.posture(q.reshape(20, 2, 6)), ROBOT.rigid.opt.gravity).torque()
     np.testing.assert_allclose(torque.reshape(20, 12), expected, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("legs_weigh", [True, False])
+def test_a_mass_in_the_foot_is_a_force_that_gravity_directs(name: str, legs_weigh: bool) -> None:
+    """Catches a mass whose lever, sign or carrying links are wrong, and weightless legs that still weigh."""
+    for seed in range(5):
+        posed = Posed(name, seed)
+        chains, mass = LegChains(posed.model, posed.legs), np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
+        posed.force = mass[:, None] * posed.gravity
+        expected = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains))
+        if not legs_weigh:
+            expected -= LegWeights(chains.posture(posed.q), posed.gravity).torque()
+        statics = LegWeights(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot, legs_weigh)
+        np.testing.assert_allclose(statics.torque(), expected, rtol=0.0, atol=1e-9)
+        assert np.abs(expected).max() > 50.0
+
+
+@pytest.mark.parametrize("name", MODELS)
 def test_feet_that_a_sensor_weighs_weigh_nothing(name: str) -> None:
-    """Catches feet that still count in the center of mass, the levers or the mass, and links that count no more."""
+    """Catches feet that still count in the center of mass, the torques or the mass, and links that count no more."""
     model, legs = MODELS[name]
     footless = copy.copy(model)
     footless.body_mass[[model.jnt_bodyid[model.joint(leg[-1]).id] for leg in legs]] = 0.0
@@ -178,20 +179,21 @@ def test_feet_that_a_sensor_weighs_weigh_nothing(name: str) -> None:
     q = np.random.default_rng(4).uniform(-1.0, 1.0, (5, len(legs), len(legs[0])))
     assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(footless), rel=1e-12)
     assert chains.mass < mujoco.mj_getTotalmass(model) - 1.0
-    for part in ("axes", "anchors", "levers", "foot_R", "com"):
-        one, other = getattr(chains.frames(q), part), getattr(expected.frames(q), part)
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12, err_msg=part)
+    np.testing.assert_allclose(chains.center_of_mass(q), expected.center_of_mass(q), rtol=0.0, atol=1e-12)
+    one, other = (LegWeights(legs.posture(q), model.opt.gravity).torque() for legs in (chains, expected))
+    np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
     assert ROBOT.chains_above_feet.mass == pytest.approx(57.0 - 2.0 * 1.616, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["thormang", "spider"])
-def test_gradient_is_the_difference_quotient_of_mujocos_torque(name: str) -> None:
+def test_gradient_of_weights_is_the_difference_quotient_of_mujocos_torque(name: str) -> None:
     """Catches a force that turns with the foot, a point that stays behind, and a term of j < i that is not mirrored."""
     h = 1e-5
     for seed in range(3):
         posed = Posed(name, seed)
-        frames = LegChains(posed.model, posed.legs).frames(posed.q)
-        gradient = holding_torque_gradient(frames, posed.gravity, posed.force, posed.point(frames))
+        chains, mass = LegChains(posed.model, posed.legs), np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
+        posed.force = mass[:, None] * posed.gravity
+        gradient = LegWeights(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot).gradient()
         legs, joints = posed.q.shape
         for j in range(joints):
             step = np.zeros((legs, joints))
@@ -202,16 +204,50 @@ def test_gradient_is_the_difference_quotient_of_mujocos_torque(name: str) -> Non
         assert np.abs(gradient).max() > 50.0
 
 
+@pytest.mark.parametrize("name", ["thormang", "spider"])
+def test_gradient_of_wrenches_is_the_difference_quotient_of_jacobians(name: str) -> None:
+    """Catches a wrench that keeps its direction while the foot turns, and a term on or below the diagonal.
+
+    The torque of the quotient is MuJoCo's −JᵀF with the wrench turned into the world by MuJoCo's foot.
+    """
+    h = 1e-6
+
+    def torque(posed: Posed, q: Array) -> Array:
+        posed.set(q)
+        found = np.zeros(posed.model.nv)
+        for leg, foot in enumerate(posed.feet):
+            R, translation, rotation = posed.data.xmat[foot].reshape(3, 3), *np.zeros((2, 3, posed.model.nv))
+            mujoco.mj_jac(posed.model, posed.data, translation, rotation, posed.data.xpos[foot], foot)
+            found -= translation.T @ R @ posed.force[leg] + rotation.T @ R @ posed.moment[leg]
+        return found[posed.model.jnt_dofadr[posed.joints]]
+
+    for seed in range(3):
+        posed = Posed(name, seed)
+        chains = LegChains(posed.model, posed.legs)
+        wrenches = FootWrenches(chains.posture(posed.q), posed.force, posed.moment)
+        np.testing.assert_allclose(wrenches.torque(), torque(posed, posed.q), rtol=0.0, atol=1e-9)
+        gradient = wrenches.gradient()
+        for j in range(posed.q.shape[1]):
+            step = np.zeros(posed.q.shape)
+            step[:, j] = h
+            quotient = (torque(posed, posed.q + step) - torque(posed, posed.q - step)) / (2.0 * h)
+            np.testing.assert_allclose(gradient[:, :, j], quotient, rtol=0.0, atol=1e-5)
+        np.testing.assert_array_equal(np.tril(gradient), 0.0)
+        assert np.abs(gradient).max() > 50.0
+
+
 def torques_of_figure_1(inward: float) -> dict[str, float]:
     """Left stance, right foot lifted 0.05 m, hip axis at 0.66 m, the center of mass over the ZMP."""
     ankles = np.array([[0.0, 0.105, 0.1], [0.0, -0.105, 0.15]])
     zmp, pelvis = np.array([0.0, 0.105 - inward, 0.0]), np.array([0.0, 0.0, 0.66])
     for _ in range(50):
-        frames = ROBOT.chains.frames(ROBOT.joint_angles(pelvis, ankles).reshape(2, 6))
-        pelvis[:2] += (zmp - pelvis - frames.com)[:2]
-    np.testing.assert_allclose((pelvis + frames.com)[:2], zmp[:2], rtol=0.0, atol=1e-12)
+        q = ROBOT.joint_angles(pelvis, ankles).reshape(2, 6)
+        com = ROBOT.chains.center_of_mass(q)
+        pelvis[:2] += (zmp - pelvis - com)[:2]
+    np.testing.assert_allclose((pelvis + com)[:2], zmp[:2], rtol=0.0, atol=1e-12)
     force = np.array([[0.0, 0.0, 57.0 * 9.81], [0.0, 0.0, 0.0]])
-    torque = holding_torque(frames, np.array([0.0, 0.0, -9.81]), force, np.tile(zmp - pelvis, (2, 1)))
+    points = np.tile(zmp - pelvis, (2, 1))
+    torque = holding_torque(ROBOT.chains, q, np.array([0.0, 0.0, -9.81]), force, points)
     return dict(zip(LEG_JOINTS, torque.ravel().tolist(), strict=True))
 
 
@@ -246,19 +282,19 @@ def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(shape: tuple[int, ...]) -
     q = generator.uniform(-1.0, 1.0, (*shape, 3, 4))
     gravity = generator.normal(size=(*shape, 3))
     force, offset, moment = generator.normal(size=(3, *shape, 3, 3))
+    mass = generator.normal(size=(*shape, 3))
 
     def everything(row: tuple[int, ...]) -> list[Array]:
-        frames = chains.frames(q[row])
-        point = frames.ankle + offset[row]
+        legs = chains.posture(q[row])
+        weights = LegWeights(legs, gravity[row], mass[row], offset[row])
+        wrenches = FootWrenches(legs, force[row], moment[row])
         return [
-            frames.axes, frames.anchors, frames.levers, frames.foot_R, frames.com, frames.ankle,
-            holding_torque(frames, gravity[row], force[row], point),
-            holding_torque(frames, gravity[row], force[row], point, moment[row]),
-            holding_torque_gradient(frames, gravity[row], force[row], point),
+            *chains.com_and_feet(q[row], (0.1, -0.2, 0.3)),
+            weights.torque(), weights.gradient(), wrenches.torque(), wrenches.gradient(),
         ]  # fmt: skip
 
     whole = everything(())
-    shapes = [(3, 4, 3), (3, 4, 3), (3, 4, 3), (3, 3, 3), (3,), (3, 3), (3, 4), (3, 4), (3, 4, 4)]
+    shapes = [(3,), (3, 3), (3, 4), (3, 4, 4), (3, 4), (3, 4, 4)]
     assert [result.shape for result in whole] == [(*shape, *own) for own in shapes]
     for row in np.ndindex(shape):
         for result, alone in zip(whole, everything(row), strict=True):
@@ -268,12 +304,10 @@ def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(shape: tuple[int, ...]) -
 def test_one_gravity_serves_a_batch() -> None:
     """Catches a gravity that is needed for each world although it is the same in all of them."""
     generator = np.random.default_rng(7)
-    q, force = generator.normal(size=(4, 2, 6)), generator.normal(size=(4, 2, 3))
-    frames, gravity = ROBOT.chains.frames(q), np.array([0.1, 0.2, -9.8])
-    each = np.tile(gravity, (4, 1))
-    for function in (holding_torque, holding_torque_gradient):
-        one = function(frames, gravity, force, frames.ankle)
-        np.testing.assert_array_equal(one, function(frames, each, force, frames.ankle))
+    legs, gravity = ROBOT.chains.posture(generator.normal(size=(4, 2, 6))), np.array([0.1, 0.2, -9.8])
+    one, each = LegWeights(legs, gravity), LegWeights(legs, np.tile(gravity, (4, 1)))
+    np.testing.assert_array_equal(one.torque(), each.torque())
+    np.testing.assert_array_equal(one.gradient(), each.gradient())
 
 
 def turned(spec: mujoco.MjSpec) -> None:
@@ -340,5 +374,4 @@ def test_products_are_those_of_numpy() -> None:
     for a, b in [((3,), (3,)), ((2, 4, 3), (2, 4, 3)), ((4, 3), (2, 1, 3)), ((3,), (5, 3)), ((5, 3), (3,))]:
         x, y = generator.normal(size=a), generator.normal(size=b)
         np.testing.assert_allclose(cross(x, y), np.cross(x, y), rtol=0.0, atol=1e-14)
-        np.testing.assert_allclose(dot(x, y), (x * y).sum(axis=-1), rtol=0.0, atol=1e-14)
     np.testing.assert_allclose(rotated(R, v), np.einsum("...ij,...j->...i", R, v), rtol=0.0, atol=1e-14)

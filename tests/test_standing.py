@@ -13,7 +13,7 @@ from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.standing import Equilibrium, settle
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
 from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import holding_torque
+from tests.legs import foot_frames, holding_torque
 
 ROBOT = Thormang()
 BIPED = biped(ROBOT)
@@ -108,9 +108,10 @@ def test_springs_at_rest_carry_the_holding_torque(name: str) -> None:
     dead = np.array([joint.backlash for joint in joints.values()]) / 2.0
     stiffness = np.array([joint.stiffness for joint in joints.values()])
     spring = stiffness * np.sign(deflection) * np.maximum(np.abs(deflection) - dead, 0.0)
-    frames = BIPED.chains.frames(rest.qpos[at.q].reshape(2, 6))
+    legs = rest.qpos[at.q].reshape(2, 6)
+    ankles, _ = foot_frames(BIPED.chains, legs)
     force, moment = forces_on_the_feet(model, data)
-    expected = holding_torque(frames, model.opt.gravity @ R, force @ R, frames.ankle, moment @ R)
+    expected = holding_torque(BIPED.chains, legs, model.opt.gravity @ R, force @ R, ankles, moment @ R)
     np.testing.assert_allclose(spring, expected.ravel(), rtol=0.0, atol=0.03)
     assert np.abs(spring).max() > 15.0
     np.testing.assert_allclose(force[:, 2].sum(), 57.0 * 9.81, rtol=0.0, atol=0.2)

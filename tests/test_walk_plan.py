@@ -19,9 +19,9 @@ from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import contact_points, load_share, shares
 from elastic_env.walking.gait import make_gait
-from elastic_env.walking.leg_chains import holding_torque
 from elastic_env.walking.preview_control import PreviewConfig, follow_zmp
 from elastic_env.walking.walk_plan import WalkPlan, derivatives, plan_walk, require_feasible, swing_height, with_torque
+from tests.legs import holding_torque
 
 PERIOD_S = 0.004
 ROBOT = biped(Thormang())
@@ -243,8 +243,8 @@ def holding(plan: WalkPlan, row: int) -> Array:
     feet = plan.ankles[row, :, :2]
     points = np.pad(contact_points(plan.zmp_of_motion[row], plan.share[row], feet), ((0, 0), (0, 1)))
     force = shares(plan.share[row])[:, None] * [0.0, 0.0, 57.0 * 9.81]
-    frames = ROBOT.chains.frames(plan.q[row].reshape(2, 6))
-    return holding_torque(frames, np.array([0.0, 0.0, -9.81]), force, points - plan.pelvis[row]).ravel()
+    gravity, legs = np.array([0.0, 0.0, -9.81]), plan.q[row].reshape(2, 6)
+    return holding_torque(ROBOT.chains, legs, gravity, force, points - plan.pelvis[row]).ravel()
 
 
 def test_at_rest_the_torque_is_the_holding_torque() -> None:

@@ -20,8 +20,8 @@ from elastic_env.signals import Array
 from elastic_env.tasks.walk_config import WalkConfig
 from elastic_env.tasks.walk_in_place import WalkTask
 from elastic_env.walking.gait import make_gait
-from elastic_env.walking.leg_chains import holding_torque
 from elastic_env.walking.leg_kinematics import LegGeometry, foot_pose
+from tests.legs import holding_torque
 
 PERIOD_S = 0.004
 WEIGHT_N = 57.0 * 9.81
@@ -304,11 +304,11 @@ def test_ankles_wind_by_the_torque_that_moves_the_force() -> None:
     q, com = shifted_pelvis(walker, 0, np.array([0.015, 0.01, 0.0]))
     action, _ = held(WalkingController(walker, **AT_ONCE), observed(walker, 0, encoder_angle=q), 400)
     shift = [*GAINS.dcm * (com - walker.plan.com[0]), 0.0]
-    frames = walker.biped.chains.frames(walker.plan.q[1].reshape(2, 6))
+    chains, legs = walker.biped.chains, walker.plan.q[1].reshape(2, 6)
     force, gravity = np.tile([0.0, 0.0, WEIGHT_N / 2.0], (2, 1)), np.array([0.0, 0.0, -9.81])
-    points = frames.ankle - np.array([0.0, 0.0, ANKLE_HEIGHT_M])
-    moved = holding_torque(frames, gravity, force, points + np.array(shift))
-    change = (moved - holding_torque(frames, gravity, force, points)).ravel()
+    _, points = chains.com_and_feet(legs, (0.0, 0.0, -ANKLE_HEIGHT_M))
+    moved = holding_torque(chains, legs, gravity, force, points + np.array(shift))
+    change = (moved - holding_torque(chains, legs, gravity, force, points)).ravel()
     np.testing.assert_allclose(1001.0 * action[ANKLES], change[ANKLES], rtol=0.0, atol=1e-3)
     assert (change[[4, 10]] > 1.0).all()  # forward
     assert (change[[5, 11]] < -0.5).all()  # to the left

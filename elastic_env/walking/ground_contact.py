@@ -10,7 +10,7 @@ taken about the origin on the ground, the ZMP is
 import numpy as np
 
 from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import cross, rotated
+from elastic_env.vectors import cross, rotated
 
 
 def ground_wrench(

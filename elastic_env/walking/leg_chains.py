@@ -1,23 +1,32 @@
-r"""Statics of legs hanging from one pelvis, in NumPy for a whole batch: frames, center of mass, torques, gradient.
+r"""Statics of legs hanging from one pelvis, in NumPy for a whole batch: center of mass, feet, joint torques, gradients.
 
-All vectors are in the pelvis frame. With axis z_i and anchor a_i of joint i of a leg, mass m_i and first moment
-s_i = Σ m c of what it carries, gravity g, and a contact force f at the point p of its foot with a moment n, the joint
-torque that holds the leg at rest is
+Every leg is a chain of hinges about coordinate axes, so that taking a vector from link to link mixes two of its
+components. All is computed in the frames of the links.
 
-.. math:: \tau_i = -z_i \cdot \big((s_i - m_i a_i) \times g + (p - a_i) \times f + n\big)
+What joint i carries has, from the joint's anchor, the first moment l_i (kg·m). Under gravity g the torque that holds it
+is, with the joint's axis z_i,
 
-which is Eq. 4 of the paper with Jacobians from the center of mass to the contact point, and its gradient, with f fixed
-and p moving with the foot, for j ≥ i
+.. math:: \tau_i = -z_i \cdot (l_i \times g)
 
-.. math:: \partial\tau_i / \partial q_j =
-    -z_i \cdot \big((z_j \times (s_j - m_j a_j)) \times g + (z_j \times (p - a_j)) \times f\big)
+Ground that takes a weight W at a point of the sole is a mass −W/g in that point, which makes this Eq. 4 of the paper
+with Jacobians from the center of mass to the contact point. A wrench on the foot, with the moment n_i about the anchor
+of joint i, adds
 
-It is symmetric, the Hessian of a potential. Legs do not couple: the pelvis' orientation is given by g.
+.. math:: \tau_i = -z_i \cdot n_i
+
+If joint j turns, all that it carries turns about its anchor. For a joint i before it
+
+* weights keep their direction, and their moment changes by (z_j × l_j) × g; they have a potential, so the gradient is
+  symmetric;
+* a wrench (f, n) that is fixed in the foot, as a sensor in the foot measures it, changes by z_j × f and z_j × n_j. For
+  i = j and i after j nothing changes.
+
+Legs do not couple: the pelvis' orientation is given by g. Vectors are lists of three components here, each an array
+over a batch, (..., L), joints first, so that every operation runs over whole batches.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property
+from typing import TypeAlias
 
 import mujoco
 import numpy as np
@@ -25,41 +34,17 @@ import numpy as np
 from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array, IntArray
 
+Vector: TypeAlias = list[Array]
+"""Three components, (..., L) each."""
+Part: TypeAlias = list[tuple[int, Array]]
+"""The components of a constant vector that are not zero, with their values on all legs."""
 
-@dataclass(frozen=True)
-class LegFrames:
-    """Legs at some joint angles, in the pelvis frame; L legs of J joints.
-
-    Attributes:
-        axes: Joint axes z_i, (..., L, J, 3).
-        anchors: A point on each axis, a_i, (..., L, J, 3) [m].
-        moments: First moments m c of the joints' own links, (..., L, J, 3) [kg·m].
-        carried: Mass that each joint carries, (L, J) [kg].
-        foot_R: Orientation of the foot, (..., L, 3, 3).
-        com: Center of mass of the whole robot, (..., 3) [m].
-    """
-
-    axes: Array
-    anchors: Array
-    moments: Array
-    carried: Array
-    foot_R: Array
-    com: Array
-
-    @cached_property
-    def levers(self) -> Array:
-        """s_i − m_i a_i of all that a joint carries, (..., L, J, 3) [kg·m]."""
-        beyond = np.cumsum(self.moments[..., ::-1, :], axis=-2)[..., ::-1, :]
-        return beyond - self.carried[..., None] * self.anchors
-
-    @property
-    def ankle(self) -> Array:
-        """Origin of the foot, where the ankle axes meet, (..., L, 3) [m]."""
-        return self.anchors[..., -1, :]
+_OTHERS = {0: (1, 2), 1: (2, 0), 2: (0, 1)}
+"""The axes into which the others turn: a rotation about the key turns the first towards the second."""
 
 
 class LegChains:
-    """Legs of one robot, each a chain of hinges about the axes of the pelvis frame.
+    """Legs of one robot, each a chain of hinges about the axes of the pelvis frame; L legs of J joints.
 
     Args:
         model: Compiled rigid model.
@@ -68,6 +53,13 @@ class LegChains:
 
     Raises:
         ConfigurationError: A leg is no chain of single hinges about a coordinate axis, or its links are turned.
+
+    Attributes:
+        axis: Coordinate axis that each joint turns about, J.
+        offset: Origin of each link in the frame of the link before it, J parts [m].
+        moment: First moment of each link from its anchor, with what is beyond it hung into the next anchor, J parts
+            [kg·m].
+        mass: Mass of the whole robot [kg].
     """
 
     def __init__(self, model: mujoco.MjModel, legs: Sequence[Sequence[str]], feet_weigh: bool = True) -> None:
@@ -75,58 +67,53 @@ class LegChains:
             raise ConfigurationError(f"all legs must have equally many joints, got {[len(leg) for leg in legs]}")
         joints = np.array([[model.joint(name).id for name in leg] for leg in legs])
         bodies = model.jnt_bodyid[joints]
-        self._axis = np.argmax(np.abs(model.jnt_axis[joints[0]]), axis=-1)
-        _require_chains(model, joints, bodies, self._axis)
-        offset = model.body_pos[bodies]  # (L, J, 3), of each link in its parent
-        self._displacements = [
-            [(component, offset[:, j, component]) for component in range(3) if offset[:, j, component].any()]
-            for j in range(offset.shape[1])
-        ]
-        """Components of each link's offset that are not zero, with their values on every leg."""
-        self._mass = model.body_mass[bodies]
+        axis = np.argmax(np.abs(model.jnt_axis[joints[0]]), axis=-1)
+        _require_chains(model, joints, bodies, axis)
+        mass = model.body_mass[bodies]
         if not feet_weigh:
-            self._mass[:, -1] = 0.0
-        self._ipos = model.body_ipos[bodies]
-        self._carried = np.cumsum(self._mass[:, ::-1], axis=1)[:, ::-1]
+            mass[:, -1] = 0.0
+        carried = np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
+        offset = model.body_pos[bodies]  # (L, J, 3)
+        moment = mass[..., None] * model.body_ipos[bodies]
+        moment[:, :-1] += carried[:, 1:, None] * offset[:, 1:]
+        self.axis: list[int] = axis.tolist()
+        self.offset, self.moment = _parts(offset), _parts(moment)
+        before = np.concatenate([np.zeros_like(moment[:, :1]), moment[:, :-1]], axis=1)
+        self._hung = _parts(np.stack([before, offset]))
+        """What taking moment and foot across a joint adds to them, (2, L) per component."""
+        self._last_moment = moment[:, -1]
         self.mass = float(model.body_mass.sum() - (0.0 if feet_weigh else model.body_mass[bodies[:, -1]].sum()))
-        """Mass of the whole robot [kg]."""
-        self._trunk_moment = self._moment_of_the_rest(model, bodies)
+        self._fixed_moment = self._moment_of_the_rest(model, bodies) + carried[:, 0] @ offset[:, 0]
+        """First moment of the trunk, and of the legs as if they were in their hips [kg·m]."""
 
-    def frames(self, q: Array) -> LegFrames:
-        """Forward kinematics of all legs, (..., L, J) [rad]."""
-        shape, J = q.shape[:-1], q.shape[-1]
-        angles = q.transpose(-1, *range(q.ndim - 1)).copy()
-        sine, cosine = np.sin(angles), np.cos(angles)
-        # joints and components come first in memory, so that every operation runs over whole batches
-        axes, anchors = np.empty((2, J, 3, *shape))
-        columns = np.zeros((3, 3, *shape))  # of the orientation of the last link
-        columns[0, 0] = columns[1, 1] = columns[2, 2] = 1.0
-        links = np.empty((J, 3, 3, *shape))
-        anchor = np.zeros((3, *shape))
-        for j in range(J):
-            for component, offset in self._displacements[j]:
-                anchor = anchor + columns[component] * offset
-            axis = self._axis[j]
-            first, second = _OTHERS[axis]
-            axes[j], anchors[j], turned = columns[axis], anchor, links[j]
-            turned[axis] = columns[axis]
-            turned[first] = cosine[j] * columns[first] + sine[j] * columns[second]
-            turned[second] = cosine[j] * columns[second] - sine[j] * columns[first]
-            columns = turned
-        per_leg = (*[1] * len(shape), -1)  # against (..., L) of a joint and component
-        ipos = self._ipos.T.reshape(3, J, *per_leg)
-        coms = anchors + links[:, 0] * ipos[0] + links[:, 1] * ipos[1] + links[:, 2] * ipos[2]
-        moments = self._mass.T.reshape(J, *per_leg) * coms
-        legs = moments.sum(axis=0).sum(axis=-1)
-        com = (self._trunk_moment + legs.transpose(*range(1, legs.ndim), 0)) / self.mass
-        return LegFrames(
-            axes=_vectors_last(axes),
-            anchors=_vectors_last(anchors),
-            moments=_vectors_last(moments),
-            carried=self._carried,
-            foot_R=columns.transpose(*range(2, columns.ndim), 1, 0),
-            com=com,
-        )
+    def posture(self, q: Array) -> "LegPosture":
+        """The legs at joint angles, (..., L, J) [rad]."""
+        return LegPosture(self, q)
+
+    def center_of_mass(self, q: Array) -> Array:
+        """Center of mass of the whole robot in the pelvis frame, (..., L, J) [rad] to (..., 3) [m]."""
+        return self.com_and_feet(q)[0]
+
+    def com_and_feet(self, q: Array, point: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
+        """Center of mass of the whole robot, and a point that is fixed in each foot, in the pelvis frame.
+
+        Args:
+            q: (..., L, J) [rad].
+            point: From the ankle, in the frame of the foot [m].
+
+        Returns:
+            (..., 3) and (..., L, 3) [m].
+        """
+        posture = self.posture(q)
+        shape = [2, *[1] * (q.ndim - 2), -1]
+        foot = np.broadcast_to(np.asarray(point), self._last_moment.shape)
+        pair = list(np.stack([self._last_moment, foot]).transpose(2, 0, 1).reshape(3, *shape))
+        for j in range(len(self.axis) - 1, -1, -1):
+            pair = posture.into_parent(j, pair)
+            for component, added in self._hung[j]:
+                pair[component] += added.reshape(shape)
+        legs, feet = np.stack(pair, axis=-1)
+        return (self._fixed_moment + legs.sum(axis=-2)) / self.mass, feet
 
     def _moment_of_the_rest(self, model: mujoco.MjModel, bodies: IntArray) -> Array:
         """First moment of all bodies that are no leg, in the pelvis frame [kg·m]."""
@@ -138,74 +125,173 @@ class LegChains:
         return model.body_mass[others] @ relative
 
 
-def holding_torque(frames: LegFrames, gravity: Array, force: Array, point: Array, moment: Array | None = None) -> Array:
-    """Joint torques of legs at rest under contact forces, see the module.
+class LegPosture:
+    """Legs at some joint angles.
 
     Args:
-        frames: Where the legs are.
-        gravity: Acceleration of gravity, (..., 3) [m/s²].
-        force: On each foot by the ground, (..., L, 3) [N].
-        point: Where it acts, (..., L, 3) [m].
-        moment: About that point, (..., L, 3) [N·m]; None for none.
-
-    Returns:
-        τ, (..., L, J) [N·m].
+        chains: The legs.
+        q: Joint angles, (..., L, J) [rad].
     """
-    load = cross(frames.levers, gravity[..., None, None, :])
-    load += cross(point[..., None, :] - frames.anchors, force[..., None, :])
-    if moment is not None:
-        load += moment[..., None, :]
-    return -dot(frames.axes, load)
+
+    def __init__(self, chains: LegChains, q: Array) -> None:
+        self.chains = chains
+        angles = q.transpose(-1, *range(q.ndim - 1)).copy()
+        self.sine, self.cosine = np.sin(angles), np.cos(angles)
+
+    def into_link(self, j: int, vector: Vector) -> Vector:
+        """A vector of the link before joint j in the frame of the link behind it."""
+        first, second = _OTHERS[self.chains.axis[j]]
+        s, c, x, y = self.sine[j], self.cosine[j], vector[first], vector[second]
+        turned = vector.copy()
+        turned[first], turned[second] = c * x + s * y, c * y - s * x
+        return turned
+
+    def into_parent(self, j: int, vector: Vector) -> Vector:
+        """A vector of the link behind joint j in the frame of the link before it."""
+        first, second = _OTHERS[self.chains.axis[j]]
+        s, c, x, y = self.sine[j], self.cosine[j], vector[first], vector[second]
+        turned = vector.copy()
+        turned[first], turned[second] = c * x - s * y, c * y + s * x
+        return turned
 
 
-def holding_torque_gradient(
-    frames: LegFrames, gravity: Array, force: Array | None = None, point: Array | None = None
-) -> Array:
-    """∂τ/∂q of `holding_torque` with the force fixed in space and its point fixed in the foot, (..., L, J, J).
+class LegWeights:
+    """Legs at rest under gravity, with a mass at a point of each foot: negative where the ground carries the foot.
 
-    Without force and point it is that of the legs' weight.
+    Args:
+        posture: Where the legs are.
+        gravity: Acceleration of gravity in the pelvis frame, (..., 3) [m/s²].
+        mass: At a point of each foot, (..., L) [kg]; None for none.
+        point: From the ankle, in the frame of the foot, (..., L, 3) [m].
+        legs_weigh: Whether the legs themselves have mass.
     """
-    turned = cross(cross(frames.axes, frames.levers), gravity[..., None, None, :])
-    if force is not None and point is not None:
-        turned += cross(cross(frames.axes, point[..., None, :] - frames.anchors), force[..., None, :])
-    product = -(frames.axes @ turned.swapaxes(-1, -2))
-    J = product.shape[-1]
-    return product * _upper(J, 0) + (product * _upper(J, 1)).swapaxes(-1, -2)
+
+    def __init__(
+        self,
+        posture: LegPosture,
+        gravity: Array,
+        mass: Array | None = None,
+        point: Array | None = None,
+        legs_weigh: bool = True,
+    ) -> None:
+        self._posture = posture
+        self._gravity = self._in_links([gravity[..., k, None] for k in range(3)])
+        self._levers = self._hanging(mass, point, legs_weigh)
+
+    def torque(self) -> Array:
+        """Joint torques that hold the legs, (..., L, J) [N·m]."""
+        torque = np.empty_like(self._posture.sine)
+        for j, axis in enumerate(self._posture.chains.axis):
+            first, second = _OTHERS[axis]
+            lever, g = self._levers[j], self._gravity[j]
+            np.subtract(lever[second] * g[first], lever[first] * g[second], out=torque[j])
+        return _joints_last(torque)
+
+    def gradient(self) -> Array:
+        """∂τ/∂q, symmetric, (..., L, J, J) [N·m/rad]."""
+        posture, axes = self._posture, self._posture.chains.axis
+        J, batch = len(axes), posture.sine.shape[1:]
+        gradient = np.empty((J, J, *batch))
+        changes = np.empty((3, J, *batch))  # of the moment, by the joints from j on
+        for j in range(J - 1, -1, -1):
+            axis, (first, second) = axes[j], _OTHERS[axes[j]]
+            lever, g, change = self._levers[j], self._gravity[j], changes[:, j]
+            np.multiply(lever[first], g[axis], out=change[first])
+            np.multiply(lever[second], g[axis], out=change[second])
+            np.negative(lever[first] * g[first] + lever[second] * g[second], out=change[axis])
+            np.negative(changes[axis, j:], out=gradient[j, j:])
+            gradient[j + 1 :, j] = gradient[j, j + 1 :]
+            if j > 0:
+                changes[:, j:] = posture.into_parent(j, list(changes[:, j:]))
+        return gradient.transpose(*range(2, gradient.ndim), 0, 1)
+
+    def _in_links(self, vector: Vector) -> list[Vector]:
+        """A vector of the pelvis frame in the frames of all links."""
+        frames = []
+        for j in range(len(self._posture.chains.axis)):
+            vector = self._posture.into_link(j, vector)
+            frames.append(vector)
+        return frames
+
+    def _hanging(self, mass: Array | None, point: Array | None, legs_weigh: bool) -> list[Vector]:
+        """First moment of what each joint carries, from its anchor, in the frame of its link."""
+        chains, posture = self._posture.chains, self._posture
+        zero = np.zeros(posture.sine.shape[1:])
+        lever: Vector = [zero, zero, zero]
+        if mass is not None and point is not None:
+            lever = [mass * point[..., k] for k in range(3)]
+        levers: list[Vector] = []
+        for j in range(len(chains.axis) - 1, -1, -1):
+            if legs_weigh:
+                lever = lever.copy()
+                for k, own in chains.moment[j]:
+                    lever[k] = lever[k] + own
+            levers.append(lever)
+            lever = posture.into_parent(j, lever)
+            if mass is not None:
+                for k, own in chains.offset[j]:
+                    lever[k] = lever[k] + mass * own
+        return levers[::-1]
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Vector product over the last axis, in the memory order of its larger argument, which makes it fast."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    x = ay * bz - az * by
-    like = a if a.shape[:-1] == x.shape else b
-    product = np.empty_like(like) if like.shape[:-1] == x.shape else np.empty((*x.shape, 3))
-    product[..., 0], product[..., 1], product[..., 2] = x, az * bx - ax * bz, ax * by - ay * bx
-    return product
+class FootWrenches:
+    """Legs at rest under a wrench on each foot that is known in the frame of the foot.
+
+    Args:
+        posture: Where the legs are.
+        force: On the foot, in its frame, (..., L, 3) [N].
+        moment: About the ankle, likewise [N·m].
+    """
+
+    def __init__(self, posture: LegPosture, force: Array, moment: Array) -> None:
+        self._posture = posture
+        f, n = ([vector[..., k] for k in range(3)] for vector in (force, moment))
+        self._wrenches: list[tuple[Vector, Vector]] = []
+        for j in range(len(posture.chains.axis) - 1, -1, -1):
+            self._wrenches.append((f, n))
+            f, n = posture.into_parent(j, f), posture.into_parent(j, n)
+            for k, own in posture.chains.offset[j]:  # d × f
+                first, second = _OTHERS[k]
+                n[first], n[second] = n[first] - own * f[second], n[second] + own * f[first]
+        self._wrenches.reverse()
+
+    def torque(self) -> Array:
+        """Joint torques that hold the legs against the wrenches, (..., L, J) [N·m]."""
+        torque = np.empty_like(self._posture.sine)
+        for j, axis in enumerate(self._posture.chains.axis):
+            np.negative(self._wrenches[j][1][axis], out=torque[j])
+        return _joints_last(torque)
+
+    def gradient(self) -> Array:
+        """∂τ/∂q with wrenches that turn with their feet, strictly upper triangular, (..., L, J, J) [N·m/rad]."""
+        posture, axes = self._posture, self._posture.chains.axis
+        J, batch = len(axes), posture.sine.shape[1:]
+        gradient = np.zeros((J, J, *batch))
+        changes = np.zeros((3, 2, J, *batch))  # of force and moment, by the joints from j on
+        for j in range(J - 1, 0, -1):
+            first, second = _OTHERS[axes[j]]
+            for part, vector in enumerate(self._wrenches[j]):
+                np.negative(vector[second], out=changes[first, part, j])
+                changes[second, part, j] = vector[first]
+            changes[:, :, j:] = posture.into_parent(j, list(changes[:, :, j:]))
+            force, moment = changes[:, 0, j:], changes[:, 1, j:]
+            for k, own in posture.chains.offset[j]:
+                first, second = _OTHERS[k]
+                moment[first] -= own * force[second]
+                moment[second] += own * force[first]
+            np.negative(moment[axes[j - 1]], out=gradient[j - 1, j:])
+        return gradient.transpose(*range(2, gradient.ndim), 0, 1)
 
 
-def dot(a: Array, b: Array) -> Array:
-    """Scalar product over the last axis of three components."""
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+def _parts(vectors: Array) -> list[Part]:
+    """Vectors of all joints of all legs, (..., L, J, 3), joint by joint."""
+    by_joint = vectors.transpose(-2, -1, *range(vectors.ndim - 2))
+    return [[(k, component) for k, component in enumerate(vector) if component.any()] for vector in by_joint]
 
 
-def rotated(R: Array, v: Array) -> Array:
-    """R v, (..., 3, 3) and (..., 3) to (..., 3)."""
-    return R[..., 0] * v[..., 0, None] + R[..., 1] * v[..., 1, None] + R[..., 2] * v[..., 2, None]
-
-
-_OTHERS = {0: (1, 2), 1: (2, 0), 2: (0, 1)}
-
-
-@cache
-def _upper(size: int, diagonal: int) -> Array:
-    """Ones above a diagonal, the diagonal included."""
-    return np.triu(np.ones((size, size)), diagonal)
-
-
-def _vectors_last(array: Array) -> Array:
-    """A view with joints and components last, (J, 3, ..., L) to (..., L, J, 3)."""
-    return array.transpose(*range(2, array.ndim), 0, 1)
+def _joints_last(array: Array) -> Array:
+    """(J, ..., L) to (..., L, J)."""
+    return array.transpose(*range(1, array.ndim), 0)
 
 
 def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:

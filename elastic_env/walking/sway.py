@@ -12,7 +12,7 @@ from scipy import linalg
 from elastic_env.rigid_body import FloatingBody
 from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
-from elastic_env.walking.leg_chains import holding_torque
+from elastic_env.walking.leg_chains import LegWeights
 from elastic_env.walking.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
 
 _DOF = 6
@@ -31,14 +31,13 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
         The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes unstable.
     """
     q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
-    frames = biped.chains.frames(q.reshape(2, -1))
-    force = np.tile([0.0, 0.0, biped.weight / 2.0], (2, 1))
-    torque = holding_torque(frames, np.array([0.0, 0.0, -biped.gravity]), force, frames.ankle).ravel()
+    legs, carried = biped.chains.posture(q.reshape(2, -1)), np.full(2, biped.chains.mass / 2.0)
+    torque = LegWeights(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3))).torque().ravel()
     theta = q + torque / stiffness
 
     def potential(x: Array) -> Array:
         angles = _angles(biped, pelvis, x)
-        com = biped.chains.frames(angles.reshape(len(x), 2, -1)).com
+        com = biped.chains.center_of_mass(angles.reshape(len(x), 2, -1))
         height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
         return 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1) + biped.weight * height
 

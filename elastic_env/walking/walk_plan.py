@@ -16,7 +16,7 @@ from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import contact_points, load_share, shares
 from elastic_env.walking.gait import RIGHT, Gait, Timing, step_timing, support_points, zmp_reference
-from elastic_env.walking.leg_chains import cross
+from elastic_env.walking.leg_chains import FootWrenches
 from elastic_env.walking.preview_control import PreviewConfig, follow_zmp
 
 _COM_TOLERANCE_M = 1e-10
@@ -93,7 +93,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     dynamics = _dynamics(biped, pelvis, q, control_period_s)
     q_dot, q_ddot = derivatives(q, control_period_s)
     share = load_share(zmp, support_points(gait, biped.footholds))
-    torque = _joint_torque(biped, pelvis, q, dynamics, share)
+    torque = _joint_torque(biped, ankles, q, dynamics, share)
     return WalkPlan(
         gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height,
         pelvis, ankles, share, torque,
@@ -103,7 +103,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
 def with_torque(plan: WalkPlan, biped: Biped, control_period_s: float) -> WalkPlan:
     """The same motion with the torques, and the ZMP, that it has on another robot of the same size."""
     dynamics = _dynamics(biped, plan.pelvis, plan.q, control_period_s)
-    torque = _joint_torque(biped, plan.pelvis, plan.q, dynamics, plan.share)
+    torque = _joint_torque(biped, plan.ankles, plan.q, dynamics, plan.share)
     return replace(plan, torque=torque, zmp_of_motion=dynamics.zmp)
 
 
@@ -147,7 +147,7 @@ def _standing(gait: Gait, biped: Biped, zmp: Array, ankles: Array) -> tuple[Arra
     """Pelvis over the ZMP at rest, and the height of the center of mass."""
     start = np.array([[*zmp, gait.hip_height_m]])
     pelvis = _pelvis_under(zmp[None], start, biped, ankles[None], np.zeros(1))
-    com = pelvis + biped.chains.frames(_angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1)).com
+    com = pelvis + biped.chains.center_of_mass(_angles(biped, pelvis, ankles[None], np.zeros(1)).reshape(1, 2, -1))
     return pelvis[0], float(com[0, 2])
 
 
@@ -156,7 +156,7 @@ def _pelvis_under(com: Array, start: Array, biped: Biped, ankles: Array, time: A
     pelvis, error = np.array(start), np.full(1, np.inf)
     for _ in range(_MAX_ITERATIONS):
         q = _angles(biped, pelvis, ankles, time)
-        error = pelvis[:, :2] + biped.chains.frames(q.reshape(len(q), 2, -1)).com[:, :2] - com
+        error = pelvis[:, :2] + biped.chains.center_of_mass(q.reshape(len(q), 2, -1))[:, :2] - com
         pelvis[:, :2] -= error
         if np.abs(error).max() < _COM_TOLERANCE_M:
             return pelvis
@@ -203,7 +203,7 @@ def _dynamics(biped: Biped, pelvis: Array, q: Array, period_s: float) -> _Dynami
     return _Dynamics(force, np.stack([x, y], axis=-1) + pelvis[:, :2], about_zmp, torque)
 
 
-def _joint_torque(biped: Biped, pelvis: Array, q: Array, dynamics: _Dynamics, share: Array) -> Array:
+def _joint_torque(biped: Biped, ankles: Array, q: Array, dynamics: _Dynamics, share: Array) -> Array:
     """Joint torques, the ground's force shared between the feet, (T, 12) [N·m]."""
     weights = shares(share)
     points = np.zeros((len(q), 2, 3))
@@ -211,10 +211,11 @@ def _joint_torque(biped: Biped, pelvis: Array, q: Array, dynamics: _Dynamics, sh
     forces = weights[..., None] * dynamics.force[:, None]
     moments = np.zeros_like(forces)
     moments[..., 2] = weights * dynamics.moment[:, None]
-    frames = biped.chains.frames(q.reshape(len(q), 2, -1))
-    arms = (points - pelvis[:, None])[..., None, :] - frames.anchors
-    load = cross(arms, forces[..., None, :]) + moments[..., None, :]
-    return dynamics.torque - (frames.axes * load).sum(axis=-1).reshape(len(q), -1)
+    arms = points - ankles
+    legs = biped.chains.posture(q.reshape(len(q), 2, -1))
+    # soles and pelvis are level: the feet's frames are parallel to the world's
+    contact = FootWrenches(legs, forces, np.cross(arms, forces) + moments)
+    return dynamics.torque + contact.torque().reshape(len(q), -1)
 
 
 def _require(
