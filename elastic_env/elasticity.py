@@ -94,9 +94,9 @@ def joint_torque(
     Returns:
         τ_J, (..., n) [N·m]; positive drives the link forward.
     """
-    half = np.asarray(backlash) / 2.0
-    beyond = np.sign(deflection) * np.maximum(np.abs(deflection) - half, 0.0)
-    return stiffness * beyond + damping * deflection_rate
+    if np.any(backlash):
+        deflection = np.sign(deflection) * np.maximum(np.abs(deflection) - np.asarray(backlash) / 2.0, 0.0)
+    return stiffness * deflection + damping * deflection_rate
 
 
 def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter = 0.0) -> Array:

@@ -15,6 +15,7 @@ from elastic_env.rendering import Picture
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array, BoolArray, Signals
 from elastic_env.simulation import Simulation
+from elastic_env.step_info import StepInfo
 from elastic_env.tasks.task import Task
 from elastic_env.worlds import Transition, Worlds
 
@@ -80,7 +81,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         self._worlds.restart(np.ones(1, dtype=np.bool_), [self.np_random])
         self._steps = 0
         self._render_human()
-        return self._worlds.task.observe()[0], _first(self._worlds.task.signals())
+        return self._worlds.task.observe()[0], _first(self._worlds.signals())
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control period under a command offset [rad]."""
@@ -92,12 +93,12 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
             float(result.reward[0]),
             bool(result.terminated[0]),
             bool(result.truncated[0]),
-            _first(result.info),
+            StepInfo({}, lambda: _first(result.info)),
         )
 
     def render(self) -> Any:
         """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
-        return self._draw().rgb(self._worlds.task.signals()) if self.render_mode == "rgb_array" else None
+        return self._draw().rgb(self._worlds.signals()) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Close the window and free the renderer."""
@@ -112,7 +113,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
 
     def _render_human(self) -> None:
         if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
-            self._draw().show(self._worlds.task.signals())
+            self._draw().show(self._worlds.signals())
 
 
 class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]):
@@ -154,7 +155,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
             if seeds[world] is not None:
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
-        return self._worlds.task.observe(), self._worlds.task.signals()
+        return self._worlds.task.observe(), self._worlds.signals()
 
     def step(
         self, actions: Action
@@ -167,10 +168,11 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         result = self._worlds.step(given)
         if restarting.any():
             result = self._restarted_instead(result, restarting)
-        self._done = result.done
-        observation, info = result.observation, _with_mask(result.info, result.done)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and result.done.any():
+        self._done = done = result.done
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and done.any():
             observation, info = self._restarted_after(result)
+        else:
+            observation, info = result.observation, _with_mask(result.info, done)
         return observation, result.reward, result.terminated, result.truncated, info
 
     def _begin(self, worlds: BoolArray) -> None:
@@ -180,7 +182,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
         """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
         self._begin(worlds)
-        fresh = self._worlds.task.signals()
+        fresh = self._worlds.signals()
         info = _restarted_info(result.info, worlds, fresh)
         return Transition(
             self._worlds.task.observe(),
@@ -197,7 +199,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
             final_observation[world] = result.observation[world].copy()
         final_info = _with_mask(result.info, result.done)
         self._begin(result.done)
-        fresh = self._worlds.task.signals()
+        fresh = self._worlds.signals()
         info = _restarted_info(result.info, result.done, fresh)
         del info["episode_metrics"]
         info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
@@ -225,10 +227,9 @@ def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> 
 
 def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
     """Episode metrics with Gymnasium's mark of the worlds that have them, left out where no episode ends."""
-    others = {key: value for key, value in info.items() if key != "episode_metrics"}
-    if not done.any():
-        return others
-    return {**others, "episode_metrics": info["episode_metrics"], "_episode_metrics": done.copy()}
+    if done.any():
+        info["_episode_metrics"] = done.copy()
+    return info
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:

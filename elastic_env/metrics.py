@@ -41,13 +41,18 @@ class RunningStatistics:
         self._count[:, worlds] = 0
 
     def update(self, values: Array, sampled: BoolArray) -> None:
-        """Take one sample of every row where `sampled` is true, (num_rows, num_worlds) both."""
+        """Take the samples of some steps where `sampled` is true, (num_steps, num_rows, num_worlds) both.
+
+        The result does not depend on how many steps are taken at once.
+        """
         counted = np.where(sampled, values, 0.0)  # where, not a product: a nan outside does not count
-        self._sum += counted
-        self._sum_of_squares += counted * counted
-        np.minimum(self._low, values, out=self._low, where=sampled)
-        np.maximum(self._high, values, out=self._high, where=sampled)
-        self._count += sampled
+        squares = counted * counted
+        for value, square in zip(counted, squares, strict=True):
+            self._sum += value
+            self._sum_of_squares += square
+        np.minimum(self._low, np.where(sampled, values, np.inf).min(axis=0), out=self._low)
+        np.maximum(self._high, np.where(sampled, values, -np.inf).max(axis=0), out=self._high)
+        self._count += sampled.sum(axis=0)
 
     def statistic(self, name: str, row: int) -> Array:
         """A statistic of a row, (num_worlds,)."""
@@ -82,9 +87,10 @@ class EpisodeMetrics:
         self._statistics.restart(worlds)
 
     def update(self, signals: Signals, masks: Mapping[str, BoolArray]) -> None:
-        """Take one step: the task's signals, (num_worlds,) each, and the masks by name."""
-        values = np.array([signals[name] for name in self._signals], dtype=np.float64)
-        self._statistics.update(values, np.array([masks[name] for name in self._masks])[self._mask_of_row])
+        """Take steps: the task's signals and the masks by name, (num_steps, num_worlds) each, or (num_worlds,)."""
+        values = np.array([np.atleast_2d(signals[name]) for name in self._signals], dtype=np.float64)
+        sampled = np.array([np.atleast_2d(masks[name]) for name in self._masks])[self._mask_of_row]
+        self._statistics.update(values.swapaxes(0, 1), sampled.swapaxes(0, 1))
 
     def values(self) -> dict[str, Array]:
         """Metrics so far, (num_worlds,) each; nan where no step was sampled."""

@@ -28,7 +28,7 @@ def quantise(angle: Array, counts_per_turn: int | None) -> Array:
     if counts_per_turn is None:
         return angle
     step = 2.0 * np.pi / counts_per_turn
-    return np.round(angle / step) * step
+    return np.rint(angle / step) * step
 
 
 def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Array) -> Array:
@@ -43,8 +43,10 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
     Returns:
         (...) [rad].
     """
-    error = sensor.bias_rad + drawn_bias + sensor.sine_error_rad * np.sin(angle)
-    return angle + error + sensor.noise_rad * noise
+    measured = angle + drawn_bias + sensor.noise_rad * noise
+    if sensor.bias_rad != 0.0 or sensor.sine_error_rad != 0.0:
+        measured += sensor.bias_rad + sensor.sine_error_rad * np.sin(angle)
+    return measured
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
@@ -64,8 +66,10 @@ class NoiseStream:
     """
 
     def __init__(self, num_worlds: int, width: int, block: int = 250) -> None:
-        self._samples = np.zeros((num_worlds, block, width))
-        self._used = np.zeros(num_worlds, dtype=np.int64)
+        # samples of a time are neighbours in memory: worlds mostly use theirs together
+        self._samples = np.zeros((block, num_worlds, width))
+        self._used, self._world = np.zeros(num_worlds, dtype=np.int64), np.arange(num_worlds)
+        self._most_used = 0
         self._generators: list[np.random.Generator] = [np.random.default_rng(0) for _ in range(num_worlds)]
 
     def restart(self, world: int, generator: np.random.Generator) -> None:
@@ -75,13 +79,16 @@ class NoiseStream:
 
     def next(self, worlds: BoolArray) -> Array:
         """The next sample of some worlds, (num_worlds, width); the rows of the others are not to be used."""
-        block = self._samples.shape[1]
-        for world in np.flatnonzero(worlds & (self._used == block)):
-            self._refill(int(world))
-        sample = self._samples[np.arange(len(self._used)), np.minimum(self._used, block - 1)]
+        block = len(self._samples)
+        if self._most_used >= block:
+            for world in np.flatnonzero(worlds & (self._used == block)):
+                self._refill(int(world))
+            self._most_used = int(self._used.max())
+        sample = self._samples[np.minimum(self._used, block - 1), self._world]
         self._used += worlds
+        self._most_used += 1
         return sample
 
     def _refill(self, world: int) -> None:
-        self._samples[world] = self._generators[world].standard_normal(self._samples.shape[1:])
+        self._samples[:, world] = self._generators[world].standard_normal((len(self._samples), self._samples.shape[2]))
         self._used[world] = 0

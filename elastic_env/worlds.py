@@ -1,5 +1,6 @@
 """N worlds of one task: the control step that scalar and vector environments share."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,8 +10,10 @@ import numpy.typing as npt
 
 from elastic_env.errors import ActionError
 from elastic_env.metrics import EpisodeMetrics
-from elastic_env.signals import Array, BoolArray
+from elastic_env.rows import Rows
+from elastic_env.signals import Array, BoolArray, Signals
 from elastic_env.simulation import simulate
+from elastic_env.step_info import StepInfo
 from elastic_env.tasks.task import Task
 
 DIVERGED = "diverged"
@@ -33,6 +36,19 @@ class Transition:
         return self.terminated | self.truncated
 
 
+_SCORED_AT_ONCE = 16
+"""Control steps whose signals are computed together."""
+
+
+@dataclass(frozen=True)
+class _Sample(Rows):
+    """What the scores of a step need: the task's sample, which actions were out of bounds, and where it diverged."""
+
+    of_task: Rows
+    is_clipped: BoolArray
+    diverged: BoolArray
+
+
 class Worlds:
     """Runs a task in many worlds: checks actions, advances physics, adds up rewards and metrics, finds the ends.
 
@@ -46,6 +62,9 @@ class Worlds:
         self.simulation = simulate(task.model, task.num_worlds, num_threads)
         self._bound = task.action_table.space(np.float32).high.astype(np.float64)
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
+        self._samples: list[_Sample] = []
+        self._no_reason = _reasons({}, task.num_worlds)
+        self._no_reason.flags.writeable = False
 
     @property
     def num_worlds(self) -> int:
@@ -54,9 +73,14 @@ class Worlds:
 
     def restart(self, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes in some worlds, a (num_worlds,) mask, each from its own generator."""
+        self._score_samples()
         self.simulation.restart(worlds)
         self.task.restart(self.simulation, worlds, generators)
         self._metrics.restart(worlds)
+
+    def signals(self) -> Signals:
+        """Truth and scores of the present state by name, (num_worlds,) each."""
+        return self.task.signals(self.task.sample())
 
     def step(self, action: npt.ArrayLike) -> Transition:
         """One control period under the actions, (num_worlds, n) [rad].
@@ -65,31 +89,46 @@ class Worlds:
             ActionError: Wrong shape, or a value that is not finite.
         """
         requested = self._checked(action)
-        offset = np.clip(requested, -self._bound, self._bound)
+        offset = np.minimum(np.maximum(requested, -self._bound), self._bound)
         self.simulation.ctrl[:] = self.task.command(offset)
         self.task.disturb(self.simulation)
         self.simulation.advance(self.task.num_substeps)
         diverged = self.simulation.diverged()
-        self.task.sense(self.simulation)
-        signals = self.task.signals()
-        signals["clipped"] = (requested != offset).any(axis=1).astype(np.float64)
-        self._metrics.update(signals, self._masks(diverged))
-        terms = self.task.reward_terms(signals, diverged)
+        self.task.sense(self.simulation, ~diverged)
+        sample = _Sample(self.task.sample(), requested != offset, diverged)
+        self._samples.append(sample)
+        terms = self.task.reward_terms(sample.of_task, diverged)
         failures = {DIVERGED: diverged, **self.task.failures()}
-        terminated = np.logical_or.reduce(list(failures.values()))
+        terminated = functools.reduce(np.logical_or, failures.values())
         truncated = self.task.finished() & ~terminated
-        info: dict[str, Any] = {**signals, "reward_terms": terms, "termination": _reasons(failures, self.num_worlds)}
+        reason = _reasons(failures, self.num_worlds) if terminated.any() else self._no_reason
+        info = StepInfo({"reward_terms": terms, "termination": reason}, lambda: self._signals(sample))
         if (terminated | truncated).any():
+            self._score_samples()
             failed = {name: mask.copy() for name, mask in failures.items()}
             info["episode_metrics"] = {**self._metrics.values(), **failed}
-        reward = np.sum(list(terms.values()), axis=0)
+        elif len(self._samples) >= _SCORED_AT_ONCE:
+            self._score_samples()
+        reward = functools.reduce(np.add, terms.values())
         return Transition(self.task.observe(), reward, terminated, truncated, info)
 
-    def _masks(self, diverged: BoolArray) -> dict[str, BoolArray]:
-        """Where the metrics take samples, by name."""
-        scored, healthy = self.task.scored(), ~diverged
-        masks = {"all": np.ones_like(diverged), "scored": scored & healthy}
-        return masks | {name: mask & masks["scored"] for name, mask in self.task.masks().items()}
+    def _signals(self, sample: "_Sample") -> Signals:
+        clipped = np.asarray(sample.is_clipped.any(axis=1), dtype=np.float64)
+        return {**self.task.signals(sample.of_task), "clipped": clipped}
+
+    def _score_samples(self) -> None:
+        """Take into the metrics what the last steps have left."""
+        if not self._samples:
+            return
+        shape = (len(self._samples), self.num_worlds)
+        joined = _Sample.joined(self._samples)
+        self._samples = []
+        masks = self.task.masks(joined.of_task)
+        if joined.diverged.any():
+            masks = {name: mask & ~joined.diverged for name, mask in masks.items()}
+        masks["all"] = np.ones(shape, dtype=np.bool_)
+        signals = {name: signal.reshape(shape) for name, signal in self._signals(joined).items()}
+        self._metrics.update(signals, {name: mask.reshape(shape) for name, mask in masks.items()})
 
     def _checked(self, action: npt.ArrayLike) -> Array:
         values = np.asarray(action, dtype=np.float64)
@@ -111,7 +150,7 @@ class Worlds:
 
 def _reasons(failures: dict[str, BoolArray], num_worlds: int) -> npt.NDArray[np.str_]:
     """Reason of termination of every world, the first that applies, "" where there is none."""
-    reasons = np.full(num_worlds, "", dtype=f"<U{max(map(len, failures))}")
+    reasons = np.full(num_worlds, "", dtype=f"<U{max(map(len, failures), default=1)}")
     for reason, failed in reversed(failures.items()):
         reasons[failed] = reason
     return reasons

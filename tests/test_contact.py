@@ -14,7 +14,7 @@ from elastic_env.robots.standing import settle
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
 from elastic_env.signals import Array
 from elastic_env.walking.contact_force import contact_points, load_share, shares
-from elastic_env.walking.ground_contact import ground_wrench, zero_moment_point
+from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 from tests.test_standing import forces_on_the_feet
 
 ROBOT = Thormang()
@@ -144,9 +144,8 @@ def stance(slope: float = 0.0, side_gravity: float = 0.0, shift: float = 0.0) ->
     contact_force, contact_moment = forces_on_the_feet(model, data)
     sensors = np.array([[data.sensor(f"{side}_{kind}").data for kind in ("force", "torque")] for side in SIDES])
     foot_R, ankle = data.xmat[feet].reshape(2, 3, 3).copy(), data.xpos[feet].copy()
-    force, moment = ground_wrench(
-        -sensors[:, 0], -sensors[:, 1], foot_R, model.body_mass[feet], model.body_ipos[feet], model.opt.gravity
-    )
+    feet_sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity)
+    force, moment = feet_sensors.ground_wrench(-sensors, foot_R)
     return Stance(data, contact_force, contact_moment, force, moment, ankle, foot_R, model.opt.gravity.copy())
 
 
@@ -204,7 +203,7 @@ def test_sensors_in_tilted_feet_give_the_force_that_acts_on_them() -> None:
         R, weight = foot_R[row, foot], mass[foot] * gravity
         total = np.cross(contact[row, foot], ground[row, foot]) + np.cross(R @ com[foot], weight)
         force[row, foot], moment[row, foot] = R.T @ (ground[row, foot] + weight), R.T @ total
-    f, n = ground_wrench(force, moment, foot_R, mass, com, gravity)
+    f, n = FootSensors(mass, com, gravity).ground_wrench(np.stack([force, moment], axis=2), foot_R)
     np.testing.assert_allclose(f, ground, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(n, np.cross(contact, ground), rtol=0.0, atol=1e-11)
 

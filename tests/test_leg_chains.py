@@ -12,7 +12,6 @@ from elastic_env.errors import ConfigurationError
 from elastic_env.rigid_body import FloatingBody
 from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped
 from elastic_env.signals import Array
-from elastic_env.vectors import cross, rotated
 from elastic_env.walking.leg_chains import FootWrenches, LegChains, LegWeights
 from tests.legs import foot_frames, holding_torque
 
@@ -365,13 +364,3 @@ def test_joints_that_do_not_follow_one_another_are_refused(order: list[int]) -> 
     """Catches joints named in another order than they are chained, and a joint that is left out."""
     with pytest.raises(ConfigurationError, match="legs must be chains"):
         LegChains(SPIDER_MODEL, [[leg[j] for j in order] for leg in SPIDER])
-
-
-def test_products_are_those_of_numpy() -> None:
-    """Catches a component of the fast products that is swapped, and broadcasting in one direction only."""
-    generator = np.random.default_rng(8)
-    R, v = generator.normal(size=(2, 4, 3, 3)), generator.normal(size=(2, 4, 3))
-    for a, b in [((3,), (3,)), ((2, 4, 3), (2, 4, 3)), ((4, 3), (2, 1, 3)), ((3,), (5, 3)), ((5, 3), (3,))]:
-        x, y = generator.normal(size=a), generator.normal(size=b)
-        np.testing.assert_allclose(cross(x, y), np.cross(x, y), rtol=0.0, atol=1e-14)
-    np.testing.assert_allclose(rotated(R, v), np.einsum("...ij,...j->...i", R, v), rtol=0.0, atol=1e-14)

@@ -182,7 +182,7 @@ class _Estimates:
         self._changes = SupportChanges(task.assumed_model) if isinstance(task.assumed_model, WalkerModel) else None
 
     def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
-        scored = self._task.scored()
+        scored = self._task.masks(self._task.sample())["scored"]
         self._sum += np.where(scored, np.square(estimate - truth.q).mean(axis=1), 0.0)
         self._count += scored
         if self._changes is not None:

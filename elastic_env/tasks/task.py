@@ -15,7 +15,10 @@ from elastic_env.simulation import Simulation
 class Task(Protocol):
     """Rules of an environment, driven by `elastic_env.worlds.Worlds` in this order every control step.
 
-    command → disturb → (physics) → sense → signals, scored, reward_terms, failures, finished → observe
+    command → disturb → (physics) → sense → sample, reward_terms, failures, finished → observe
+
+    What a step is scored by is kept in a sample, of which signals and masks are made when they are needed: together for
+    many steps, whose samples are joined.
     """
 
     name: str
@@ -44,28 +47,28 @@ class Task(Protocol):
         """Apply what acts on the robot from outside during the coming control period."""
         ...
 
-    def sense(self, simulation: Simulation) -> None:
-        """Take truth and measurements of the new state; worlds that diverged keep their last ones."""
+    def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
+        """Take truth and measurements of the new state; worlds that are not healthy, having diverged, keep theirs."""
         ...
 
     def observe(self) -> Array:
         """A fresh observation, (num_worlds, len(observation_table))."""
         ...
 
-    def signals(self) -> Signals:
-        """Truth and scores of this step by name, (num_worlds,) each."""
+    def sample(self) -> Any:
+        """What signals and masks need of this step, `elastic_env.rows.Rows` that nothing changes later."""
         ...
 
-    def reward_terms(self, signals: Signals, diverged: BoolArray) -> dict[str, Array]:
+    def signals(self, sample: Any) -> Signals:
+        """Truth and scores of samples by name, one value per row."""
+        ...
+
+    def masks(self, sample: Any) -> dict[str, BoolArray]:
+        """Samples that count in the metrics, "scored", and the parts of them that the metrics name, by row."""
+        ...
+
+    def reward_terms(self, sample: Any, diverged: BoolArray) -> dict[str, Array]:
         """Weighted terms whose sum is the reward, (num_worlds,) each."""
-        ...
-
-    def scored(self) -> BoolArray:
-        """Worlds whose present step counts in the metrics."""
-        ...
-
-    def masks(self) -> dict[str, BoolArray]:
-        """Further masks that the metrics name, parts of `scored`."""
         ...
 
     def finished(self) -> BoolArray:

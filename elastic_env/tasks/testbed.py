@@ -26,8 +26,9 @@ from elastic_env.plan import PlanTable
 from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec
+from elastic_env.rows import Rows
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
-from elastic_env.signals import Array, BoolArray, Signal, Signals, SignalTable
+from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
 from elastic_env.simulation import Simulation
 from elastic_env.tasks.testbed_config import TestbedConfig, num_substeps, require_feasible
 
@@ -74,6 +75,25 @@ class TestbedTruth:
     joint_torque: Array
     stiffness: Array
     model: RobotModel
+
+
+@dataclass(frozen=True)
+class TestbedSample(Rows):
+    """What a step is scored by, (n,) each; names as in the signals that are made of it."""
+
+    __test__ = False
+
+    step: IntArray
+    q_ref: Array
+    scored: BoolArray
+    rest: IntArray
+    theta: Array
+    theta_dot: Array
+    q: Array
+    q_dot: Array
+    imu: Array
+    servo_error: Array
+    command_rate: Array
 
 
 def tracking_penalty(link_error: Array) -> Array:
@@ -133,7 +153,7 @@ class TestbedTask:
             self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0)
             self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
-        self._step[worlds] = 0
+        self._step = np.where(worlds, 0, self._step)
         self._offset[worlds] = self._offset_before[worlds] = 0.0
         self._command[worlds] = self._reference.at(self._step).q[worlds]
         self._place(simulation, worlds)
@@ -152,10 +172,9 @@ class TestbedTask:
     def disturb(self, simulation: Simulation) -> None:
         """Nothing pushes the testbed."""
 
-    def sense(self, simulation: Simulation) -> None:
+    def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
         """Read the new state, then what the sensors show of it."""
-        self._step += 1
-        healthy = ~simulation.diverged()
+        self._step = self._step + 1
         self._read(simulation, healthy)
         before, self._measured = self._measured, self._measure(healthy)
         self._shown = before if self.config.scenario.delay_steps else self._measured
@@ -170,40 +189,45 @@ class TestbedTask:
             columns.append(shown.imu)
         return np.stack(columns, axis=-1)
 
-    def signals(self) -> Signals:
-        """Truth and scores of this step, (num_worlds,) each."""
+    def sample(self) -> TestbedSample:
+        """What this step is scored by."""
         reference = self._reference.at(self._step)
-        truth = self.truth()
+        servo_error = self._command - self._encoder_bias - self._theta
+        command_rate = (self._offset - self._offset_before) / self.config.control_period_s
+        return TestbedSample(
+            self._step, reference.q, reference.scored, reference.rest, self._theta, self._theta_dot, self._q,
+            self._q_dot, self._shown.imu, servo_error, command_rate,
+        )  # fmt: skip
+
+    def signals(self, sample: TestbedSample) -> Signals:
+        """Truth and scores of samples, one value per row."""
+        deflection = sample.theta - sample.q
         return {
-            "time_s": self._step * self.config.control_period_s,
-            "reference_angle": reference.q,
-            "link_angle": self._q.copy(),
-            "link_angle_imu": self._shown.imu.copy(),
-            "link_error": reference.q - self._q,
-            "link_error_imu": reference.q - self._shown.imu,
-            "deflection": truth.deflection[:, 0],
-            "joint_torque": truth.joint_torque[:, 0],
-            "servo_error": self._command - self._encoder_bias - self._theta,
-            "command_rate": (self._offset - self._offset_before) / self.config.control_period_s,
-            "rest": reference.rest,
+            "time_s": sample.step * self.config.control_period_s,
+            "reference_angle": sample.q_ref.copy(),
+            "link_angle": sample.q.copy(),
+            "link_angle_imu": sample.imu.copy(),
+            "link_error": sample.q_ref - sample.q,
+            "link_error_imu": sample.q_ref - sample.imu,
+            "deflection": deflection,
+            "joint_torque": self._joint_torque(deflection, sample.theta_dot - sample.q_dot),
+            "servo_error": sample.servo_error.copy(),
+            "command_rate": sample.command_rate.copy(),
+            "rest": sample.rest.copy(),
         }
 
-    def reward_terms(self, signals: Signals, diverged: BoolArray) -> dict[str, Array]:
+    def masks(self, sample: TestbedSample) -> dict[str, BoolArray]:
+        """Windows at rest of `hold`; all but standing and onset of the other references."""
+        return {"scored": sample.scored}
+
+    def reward_terms(self, sample: TestbedSample, diverged: BoolArray) -> dict[str, Array]:
         """Weighted penalties for link error, restless commands and divergence."""
         weights = self.config.reward
         return {
-            "link_error": weights.link_error * tracking_penalty(signals["link_error"]),
-            "command_rate": weights.command_rate * smoothness_penalty(signals["command_rate"]),
+            "link_error": weights.link_error * tracking_penalty(sample.q_ref - sample.q),
+            "command_rate": weights.command_rate * smoothness_penalty(sample.command_rate),
             "divergence": weights.divergence * divergence_penalty(diverged),
         }
-
-    def scored(self) -> BoolArray:
-        """Windows at rest of `hold`; all but standing and onset of the other references."""
-        return self._reference.at(self._step).scored
-
-    def masks(self) -> dict[str, BoolArray]:
-        """None besides those of every task."""
-        return {}
 
     def finished(self) -> BoolArray:
         """The reference has come to its end."""
@@ -215,12 +239,15 @@ class TestbedTask:
 
     def truth(self) -> TestbedTruth:
         """State without noise, and the true parameters."""
-        joint = self._joint
-        deflection, deflection_rate = self._theta - self._q, self._theta_dot - self._q_dot
-        torque = joint_torque(deflection, deflection_rate, joint.stiffness, joint.damping, joint.backlash)
-        stiffness = np.full_like(torque, joint.stiffness)
+        deflection = self._theta - self._q
+        torque = self._joint_torque(deflection, self._theta_dot - self._q_dot)
+        stiffness = np.full_like(torque, self._joint.stiffness)
         columns = (self._theta, self._theta_dot, self._q, self._q_dot, deflection, torque, stiffness)
         return TestbedTruth(*(column[:, None].copy() for column in columns), model=self._true_model)
+
+    def _joint_torque(self, deflection: Array, deflection_rate: Array) -> Array:
+        joint = self._joint
+        return joint_torque(deflection, deflection_rate, joint.stiffness, joint.damping, joint.backlash)
 
     def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
         joint, pendulum = self._joint, self._pendulum
@@ -233,11 +260,12 @@ class TestbedTask:
             simulation.act[worlds] = pendulum.torque(q) / joint.servo.integral_gain
 
     def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
-        at = self._at
-        self._theta[worlds] = simulation.qpos[worlds, at.theta[0]]
-        self._theta_dot[worlds] = simulation.qvel[worlds, at.theta_dot[0]]
-        self._q[worlds] = simulation.qpos[worlds, at.q[0]]
-        self._q_dot[worlds] = simulation.qvel[worlds, at.q_dot[0]]
+        """The true state of some worlds; the others keep their last one."""
+        at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
+        self._theta = np.where(worlds, qpos[:, at.theta[0]], self._theta)
+        self._theta_dot = np.where(worlds, qvel[:, at.theta_dot[0]], self._theta_dot)
+        self._q = np.where(worlds, qpos[:, at.q[0]], self._q)
+        self._q_dot = np.where(worlds, qvel[:, at.q_dot[0]], self._q_dot)
 
     def _measure(self, worlds: BoolArray) -> "_Measurement":
         """What the sensors say now; the other worlds keep their last values."""
@@ -253,20 +281,12 @@ class TestbedTask:
 
 
 @dataclass(frozen=True)
-class _Measurement:
+class _Measurement(Rows):
     """Sensor values, (num_worlds,) each [rad]; the encoder also a control period earlier."""
 
     encoder: Array
     encoder_before: Array
     imu: Array
-
-    def with_worlds(self, worlds: BoolArray, other: "_Measurement") -> "_Measurement":
-        """These values with those of another measurement in some worlds."""
-        return _Measurement(
-            np.where(worlds, other.encoder, self.encoder),
-            np.where(worlds, other.encoder_before, self.encoder_before),
-            np.where(worlds, other.imu, self.imu),
-        )
 
 
 def _rest_angle(theta: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:

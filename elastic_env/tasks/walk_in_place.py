@@ -35,6 +35,7 @@ from elastic_env.metrics import Metric
 from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
+from elastic_env.scenario import Scenario
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.simulation import Simulation
@@ -47,10 +48,21 @@ from elastic_env.tasks.walk_config import (
     robot_bank,
     spring_ids,
 )
-from elastic_env.tasks.walk_state import WalkMeasurement, WalkState, WalkTruth, attitude_of, rms, rotation_of
-from elastic_env.tasks.walk_tables import ACTION, FELL, METRICS, OBSERVATION
+from elastic_env.tasks.walk_state import (
+    ATTITUDE,
+    RATE,
+    WRENCH,
+    WalkMeasurement,
+    WalkSample,
+    WalkState,
+    WalkTruth,
+    attitude_of,
+    rms,
+    rotation_of,
+)
+from elastic_env.tasks.walk_tables import ACTION, FELL, METRICS, OBSERVATION, PHASES
 from elastic_env.walking.gait import LEFT, RIGHT
-from elastic_env.walking.ground_contact import ground_wrench, zero_moment_point
+from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 from elastic_env.walking.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 
 UNLOADED_SHARE = 0.05
@@ -93,17 +105,22 @@ class WalkTask:
         self._bank = robot_bank(config.scenario)
         self._springs = spring_ids(self.model) if config.form == "tendon" else None
         feet = [self.model.body(f"{side}_foot").id for side in SIDES]
-        self._foot_mass, self._foot_com = self.model.body_mass[feet], self.model.body_ipos[feet]
+        self._foot_sensors = FootSensors(
+            self.model.body_mass[feet], self.model.body_ipos[feet], self.model.opt.gravity.copy()
+        )
         self._sites = np.array([self.model.site(f"{side}_ft").id for side in SIDES])
         self._torso = self.model.body("upper_body").id
-        self._gravity = self.model.opt.gravity.copy()
         self._weight = float(self.model.body_mass.sum()) * robot.gravity
         # sensors that carry nothing stand for a ground that carries the feet
-        self._least_force = UNLOADED_SHARE * self._weight + float(self._foot_mass.sum()) * robot.gravity
+        self._least_force = UNLOADED_SHARE * self._weight + float(self.model.body_mass[feet].sum()) * robot.gravity
         n, m = num_worlds, len(LEG_JOINTS)
-        self._step = np.zeros(n, dtype=np.int64)
+        self.num_steps = self.plan.num_steps
+        """Control steps of an episode."""
+        self._count(np.zeros(n, dtype=np.int64))
+        self._reference, self._phases = _reference_rows(self.plan), _phase_rows(self.plan)
         self._draw = np.zeros(n, dtype=np.int64)
-        self._stiffness = np.tile(self._true_model.stiffness, (n, 1))
+        self._stiffness, self._damping = np.tile(self._true_model.stiffness, (n, 1)), self._true_model.damping
+        self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
         self._encoder_bias, self._imu_bias = np.zeros((n, m)), np.zeros((n, 2))
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
         self._noise = NoiseStream(n, width=_NOISE_WIDTH)
@@ -111,18 +128,16 @@ class WalkTask:
         self._measured = self._shown = WalkMeasurement.zeros(n)
         self._offset, self._offset_before, self._command = np.zeros((3, n, m))
         self._contact_since = np.full(n, -1, dtype=np.int64)
-        self._is_touchdown = np.zeros(self.plan.num_steps + 1, dtype=np.bool_)
-        single = self.plan.timing.single
-        self._is_touchdown[1:] = single[:-1] & ~single[1:]
-
-    @property
-    def num_steps(self) -> int:
-        """Control steps of an episode."""
-        return self.plan.num_steps
+        self._fallen = np.zeros(n, dtype=np.bool_)
+        self._noise_spread = _noise_spread(config.scenario)
+        self._imu_is_due_always = config.scenario.pelvis_imu.rate_hz * config.control_period_s >= 1.0
 
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place robots in static equilibrium under zero offset."""
         scenario = self.config.scenario
+        # samples of the steps before keep what they hold
+        self._offset, self._offset_before = self._offset.copy(), self._offset_before.copy()
+        self._stiffness, self._contact_since = self._stiffness.copy(), self._contact_since.copy()
         for field in _DERIVED:
             simulation.bind(field)
         simulation.bind("xfrc_applied")[worlds] = 0.0
@@ -133,21 +148,21 @@ class WalkTask:
             self._draw_push(world, generator)
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
             self._place(simulation, world)
-        self._step[worlds] = 0
+        self._count(np.where(worlds, 0, self._step))
         self._offset[worlds] = self._offset_before[worlds] = 0.0
         self._command[worlds] = self.plan.q[0]
         self._contact_since[worlds] = -1
         simulation.refresh(worlds)
         self._read(simulation, worlds)
         fresh = self._measure(worlds)
-        at_rest = WalkMeasurement(fresh.encoder, fresh.encoder, fresh.attitude, fresh.rate, fresh.wrench)
+        at_rest = WalkMeasurement(fresh.encoder, fresh.encoder, fresh.body)
         self._measured = self._measured.with_worlds(worlds, at_rest)
         self._shown = self._shown.with_worlds(worlds, at_rest)
 
     def command(self, offset: Array) -> Array:
         """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
         self._offset_before, self._offset = self._offset, offset.copy()
-        self._command = self.plan.q[self._row(1)] + self._offset
+        self._command = self.plan.q[self._next] + offset
         return self._command - self._encoder_bias
 
     def disturb(self, simulation: Simulation) -> None:
@@ -158,10 +173,9 @@ class WalkTask:
             active = (since >= 0) & (since < steps)
             simulation.bind("xfrc_applied")[:, self._torso, :3] = np.where(active[:, None], self._push_force, 0.0)
 
-    def sense(self, simulation: Simulation) -> None:
+    def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
         """Read the new state, then what the sensors show of it."""
-        self._step += 1
-        healthy = ~simulation.diverged()
+        self._count(self._step + 1)
         self._read(simulation, healthy)
         before, self._measured = self._measured, self._measure(healthy)
         self._shown = before if self.config.scenario.delay_steps else self._measured
@@ -169,40 +183,35 @@ class WalkTask:
 
     def observe(self) -> Array:
         """See the table of the module."""
-        row, shown, plan, timing = self._row(1), self._shown, self.plan, self.plan.timing
+        shown = self._shown
         observation = np.empty((self.num_worlds, len(OBSERVATION)))
         observation[:, 0:12] = shown.encoder
         observation[:, 12:24] = (shown.encoder - shown.encoder_before) / self.config.control_period_s
-        observation[:, 24:26] = shown.attitude
-        observation[:, 26:29] = shown.rate
-        observation[:, 29:41] = shown.wrench
-        observation[:, 41:53] = plan.q[row]
-        observation[:, 53:65] = plan.q_dot[row]
-        observation[:, 65:77] = plan.q_ddot[row]
-        observation[:, 77] = timing.time[row]
-        observation[:, 78] = timing.swing[row]
-        observation[:, 79] = timing.support[row]
-        observation[:, 80] = plan.share[row]
-        observation[:, 81:83] = plan.zmp[row]
+        observation[:, 24:41] = shown.body
+        observation[:, 41:83] = self._reference[self._next]
         observation[:, 83:95] = self._command
         return observation
 
-    def signals(self) -> Signals:
-        """Truth and scores of this step, (num_worlds,) each."""
-        row, state, plan = self._row(), self._state, self.plan
-        q_ref = plan.q[row]
-        error = q_ref - state.q
-        deflection = state.theta - state.q
-        torque = joint_torque(deflection, state.theta_dot - state.q_dot, self._stiffness, self._true_model.damping)
+    def sample(self) -> WalkSample:
+        """What this step is scored by."""
+        return WalkSample(
+            self._step, self._state, self._offset, self._offset_before, self._stiffness, self._contact_since
+        )
+
+    def signals(self, sample: WalkSample) -> Signals:
+        """Truth and scores of samples, one value per row."""
+        row, state, plan, timing = self._row(sample.step), sample.state, self.plan, self.plan.timing
+        error, deflection = plan.q[row] - state.q, state.theta - state.q
+        deflection_rate = state.theta_dot - state.q_dot
+        torque = joint_torque(deflection, deflection_rate, sample.stiffness, self._damping, self._backlash)
         zmp_ref = plan.zmp[row]
         deviation = state.zmp - zmp_ref
-        roll, pitch, tilt = state.attitude.T
-        rate = (self._offset - self._offset_before) / self.config.control_period_s
+        roll, pitch, tilt = state.attitude.T.copy()
         return {
-            "time_s": self._step * self.config.control_period_s,
-            "pelvis_roll": roll.copy(),
-            "pelvis_pitch": pitch.copy(),
-            "pelvis_error": tilt.copy(),
+            "time_s": sample.step * self.config.control_period_s,
+            "pelvis_roll": roll,
+            "pelvis_pitch": pitch,
+            "pelvis_error": tilt,
             "pelvis_height": state.pelvis[:, 2].copy(),
             "zmp_x": state.zmp[:, 0].copy(),
             "zmp_y": state.zmp[:, 1].copy(),
@@ -217,43 +226,37 @@ class WalkTask:
             "deflection": rms(deflection),
             "joint_torque": np.abs(torque).max(axis=1),
             "servo_torque": rms(state.servo_torque),
-            "command_rate": rms(rate),
+            "command_rate": self._command_rate(sample),
             "force_left": state.force[:, LEFT].copy(),
             "force_right": state.force[:, RIGHT].copy(),
             "load_share": plan.share[row],
-            "swing": plan.timing.swing[row],
-            "single_support": plan.timing.single[row],
-            "support": plan.timing.support[row],
-            "early_touchdown": self._earliness(),
+            "swing": timing.swing[row],
+            "single_support": timing.single[row],
+            "support": timing.support[row],
+            "early_touchdown": self._earliness(sample),
         }
 
-    def reward_terms(self, signals: Signals, diverged: BoolArray) -> dict[str, Array]:
+    def masks(self, sample: WalkSample) -> dict[str, BoolArray]:
+        """The walk (standing before and after it does not count), its phases, and where there is a ZMP."""
+        loaded = ~np.isnan(sample.state.zmp[:, 0])
+        phases = self._phases[:, self._row(sample.step)]
+        names = [f"{name}_loaded" for name in PHASES]
+        return {
+            **dict(zip(["scored", *PHASES, "touchdown"], phases, strict=True)),
+            **dict(zip(["loaded", *names], phases[:-1] & loaded, strict=True)),
+            "unloaded": phases[0] & ~loaded,
+        }
+
+    def reward_terms(self, sample: WalkSample, diverged: BoolArray) -> dict[str, Array]:
         """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
-        weights = self.config.reward
-        fallen = diverged | self._fallen()
+        weights, state = self.config.reward, sample.state
+        deviation = state.zmp - self._zmp_reference
         return {
-            "tilt": weights.tilt * tilt_penalty(signals["pelvis_error"]),
-            "zmp": weights.zmp * zmp_penalty(signals["zmp_deviation"]),
-            "effort": -weights.effort * signals["servo_torque"],
-            "smoothness": -weights.smoothness * signals["command_rate"],
-            "fall": -weights.fall * fallen.astype(np.float64),
-        }
-
-    def scored(self) -> BoolArray:
-        """The walk: standing before and after it does not count."""
-        return self.plan.timing.walking[self._row()]
-
-    def masks(self) -> dict[str, BoolArray]:
-        """Phases, and where there is a ZMP."""
-        row, timing = self._row(), self.plan.timing
-        loaded = ~np.isnan(self._state.zmp[:, 0])
-        phases = {"double": ~timing.single[row], "single": timing.single[row], "transition": timing.transition[row]}
-        return {
-            **phases,
-            **{f"{name}_loaded": mask & loaded for name, mask in phases.items()},
-            "loaded": loaded,
-            "unloaded": ~loaded,
-            "touchdown": self._is_touchdown[row],
+            "tilt": weights.tilt * tilt_penalty(state.attitude[:, 2]),
+            "zmp": weights.zmp * zmp_penalty(np.hypot(deviation[:, 0], deviation[:, 1])),
+            "effort": -weights.effort * rms(state.servo_torque),
+            "smoothness": -weights.smoothness * self._command_rate(sample),
+            "fall": -weights.fall * (diverged | self._fallen),
         }
 
     def finished(self) -> BoolArray:
@@ -262,20 +265,25 @@ class WalkTask:
 
     def failures(self) -> dict[str, BoolArray]:
         """A fall: the pelvis is too low or too much tilted."""
-        return {FELL: self._fallen()}
+        return {FELL: self._fallen}
 
     def truth(self) -> WalkTruth:
         """State without noise, and the true parameters."""
         s = self._state
-        copies = (x.copy() for x in (s.theta, s.theta_dot, s.q, s.q_dot, s.pelvis, s.pelvis_R, s.ankles))
+        pelvis_R = rotation_of(s.quaternion)
+        copies = (x.copy() for x in (s.theta, s.theta_dot, s.q, s.q_dot, s.pelvis, pelvis_R, s.ankles))
         return WalkTruth(*copies, stiffness=self._stiffness.copy(), model=self._true_model)
 
-    def _row(self, ahead: int = 0) -> IntArray:
-        return np.minimum(self._step + ahead, self.num_steps)
+    def _row(self, step: IntArray) -> IntArray:
+        return np.minimum(step, self.num_steps)
 
-    def _fallen(self) -> BoolArray:
-        low = self._state.pelvis[:, 2] < FALL_HEIGHT_SHARE * self.config.gait.hip_height_m
-        return low | (self._state.attitude[:, 2] > FALL_TILT_RAD)
+    def _count(self, step: IntArray) -> None:
+        self._step, self._now, self._next = step, self._row(step), self._row(step + 1)
+        self._zmp_reference = self.plan.zmp[self._now]
+
+    def _command_rate(self, sample: WalkSample) -> Array:
+        """Rate of change of the offsets, rms over the joints [rad/s]."""
+        return rms(sample.offset - sample.offset_before) / self.config.control_period_s
 
     def _draw_push(self, world: int, generator: np.random.Generator) -> None:
         """Time and direction of the push, in the walk."""
@@ -305,63 +313,84 @@ class WalkTask:
     def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
         """The true state of some worlds; the others keep their last one."""
         at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
-        sensors = -simulation.bind("sensordata").reshape(-1, 2, 2, 3)  # MuJoCo's act on the foot, ours on the leg
-        foot_R = np.take(simulation.bind("site_xmat"), self._sites, axis=1).reshape(-1, 2, 3, 3)
-        ankles = np.take(simulation.bind("site_xpos"), self._sites, axis=1)
-        force, moment = ground_wrench(
-            sensors[:, :, 0], sensors[:, :, 1], foot_R, self._foot_mass, self._foot_com, self._gravity
-        )
-        pelvis_R = rotation_of(qpos[:, 3:7])
+        wrench = -simulation.bind("sensordata")  # MuJoCo's act on the foot, ours on the leg
+        foot_R = simulation.bind("site_xmat").take(self._sites, axis=1).reshape(-1, 2, 3, 3)
+        ankles = simulation.bind("site_xpos").take(self._sites, axis=1)
+        force, moment = self._foot_sensors.ground_wrench(wrench.reshape(-1, 2, 2, 3), foot_R)
         fresh = WalkState(
             # take, not an index: the memory order of its result does not depend on the number of worlds
-            theta=np.take(qpos, at.theta, axis=1),
-            theta_dot=np.take(qvel, at.theta_dot, axis=1),
-            q=np.take(qpos, at.q, axis=1),
-            q_dot=np.take(qvel, at.q_dot, axis=1),
+            theta=qpos.take(at.theta, axis=1),
+            theta_dot=qvel.take(at.theta_dot, axis=1),
+            q=qpos.take(at.q, axis=1),
+            q_dot=qvel.take(at.q_dot, axis=1),
             pelvis=qpos[:, :3].copy(),
-            pelvis_R=pelvis_R,
-            attitude=attitude_of(pelvis_R),
+            quaternion=qpos[:, 3:7].copy(),
+            attitude=attitude_of(qpos[:, 3:7]),
             rate=qvel[:, 3:6].copy(),
             ankles=ankles,
-            wrench=sensors.reshape(-1, 12),
+            wrench=wrench,
             force=force[..., 2],
             zmp=zero_moment_point(force, moment, ankles, self._least_force),
             servo_torque=simulation.bind("actuator_force").copy(),
         )
         self._state = fresh if worlds.all() else self._state.with_worlds(worlds, fresh)
+        low = self._state.pelvis[:, 2] < FALL_HEIGHT_SHARE * self.config.gait.hip_height_m
+        self._fallen = low | (self._state.attitude[:, 2] > FALL_TILT_RAD)
 
     def _measure(self, worlds: BoolArray) -> WalkMeasurement:
         """What the sensors say now; the other worlds keep their last values."""
         scenario, state, last = self.config.scenario, self._state, self._measured
         counts = self._true_model.encoder_counts_per_turn if scenario.encoder_counts else None
         noise = self._noise.next(worlds)
-        due = worlds & is_due(self._step, scenario.pelvis_imu.rate_hz, self.config.control_period_s)
-        tilt = attitude(scenario.pelvis_imu, state.attitude[:, :2], self._imu_bias, noise[:, 0:2])
-        spread = np.array([*[scenario.force_noise_n] * 3, *[scenario.moment_noise_nm] * 3] * 2)
-        fresh = WalkMeasurement(
-            encoder=quantise(state.theta + self._encoder_bias, counts),
-            encoder_before=last.encoder,
-            attitude=np.where(due[:, None], tilt, last.attitude),
-            rate=np.where(due[:, None], state.rate + scenario.gyro_noise_rad_s * noise[:, 2:5], last.rate),
-            wrench=state.wrench + spread * noise[:, 5:17],
-        )
+        body = noise * self._noise_spread
+        body[:, ATTITUDE] = attitude(scenario.pelvis_imu, state.attitude[:, :2], self._imu_bias, noise[:, ATTITUDE])
+        body[:, RATE] += state.rate
+        body[:, WRENCH] += state.wrench
+        if not self._imu_is_due_always:
+            due = worlds & is_due(self._step, scenario.pelvis_imu.rate_hz, self.config.control_period_s)
+            body[:, : WRENCH.start] = np.where(due[:, None], body[:, : WRENCH.start], last.body[:, : WRENCH.start])
+        encoder = quantise(state.theta + self._encoder_bias, counts)
+        fresh = WalkMeasurement(encoder, last.encoder, body)
         return fresh if worlds.all() else last.with_worlds(worlds, fresh)
 
     def _watch_swing_foot(self) -> None:
         """Since when the swing foot has been on the ground in the second half of its swing."""
-        row, timing = self._row(), self.plan.timing
+        row, timing = self._now, self.plan.timing
+        single, swing = timing.single[row], timing.swing[row]
         swing_foot = RIGHT - timing.support[row]
         loaded = self._state.force[np.arange(self.num_worlds), swing_foot] > UNLOADED_SHARE * self._weight
-        descending = timing.single[row] & (timing.swing[row] > 0.5)
-        first = descending & loaded & (self._contact_since < 0)
-        self._contact_since = np.where(first, self._step, self._contact_since)
-        rising = timing.single[row] & (timing.swing[row] <= 0.5)
-        self._contact_since = np.where(rising, -1, self._contact_since)
+        late = swing > 0.5
+        first = single & late & loaded & (self._contact_since < 0)
+        since = np.where(first, self._step, self._contact_since)
+        self._contact_since = np.where(single & ~late, -1, since)
 
-    def _earliness(self) -> Array:
+    def _earliness(self, sample: WalkSample) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
-        early = (self._step - self._contact_since) * self.config.control_period_s
-        return np.where(self._is_touchdown[self._row()] & (self._contact_since >= 0), early, 0.0)
+        early = (sample.step - sample.contact_since) * self.config.control_period_s
+        is_touchdown = self._phases[TOUCHDOWN, self._row(sample.step)]
+        return np.where(is_touchdown & (sample.contact_since >= 0), early, 0.0)
+
+
+def _reference_rows(plan: WalkPlan) -> Array:
+    """What the observation shows of the plan, one row per control step."""
+    timing = plan.timing
+    clock = [timing.time, timing.swing, timing.support, plan.share]
+    return np.column_stack([plan.q, plan.q_dot, plan.q_ddot, *clock, plan.zmp])
+
+
+def _phase_rows(plan: WalkPlan) -> BoolArray:
+    """The walk, its phases in the order of `PHASES`, and when a foot should touch down, by control step."""
+    timing, touchdown = plan.timing, np.zeros_like(plan.timing.single)
+    touchdown[1:] = timing.single[:-1] & ~timing.single[1:]
+    return timing.walking & np.stack(
+        [np.ones_like(touchdown), ~timing.single, timing.single, timing.transition, touchdown]
+    )
+
+
+def _noise_spread(scenario: Scenario) -> Array:
+    """Standard deviations of gyroscope and foot sensors, (17,); the attitude sensor scales its noise itself."""
+    wrench = [scenario.force_noise_n] * 3 + [scenario.moment_noise_nm] * 3
+    return np.array([0.0] * 2 + [scenario.gyro_noise_rad_s] * 3 + wrench * 2)
 
 
 def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
@@ -374,6 +403,8 @@ def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
 _DERIVED = ("sensordata", "site_xpos", "site_xmat", "actuator_force")
 """What is read of the physics beside its state."""
 _NOISE_WIDTH = 2 + 3 + 12
+TOUCHDOWN = -1
+"""Row of the touch-downs among the phases."""
 
 
 def _num_substeps(config: WalkConfig) -> int:

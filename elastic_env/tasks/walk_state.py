@@ -1,15 +1,17 @@
 """State and measurements of the walkers of a batch, one row per world."""
 
-from dataclasses import dataclass, fields
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.robots.thormang import LEG_JOINTS
-from elastic_env.signals import Array, BoolArray
+from elastic_env.rows import Rows
+from elastic_env.signals import Array, IntArray
 
 _JOINTS, _WRENCHES = len(LEG_JOINTS), 12
+ATTITUDE, RATE, WRENCH = slice(0, 2), slice(2, 5), slice(5, 17)
+"""Columns of what the body's sensors measure."""
 
 
 @dataclass(frozen=True)
@@ -36,25 +38,13 @@ class WalkTruth:
     model: WalkerModel
 
 
-class _Rows:
-    """Arrays with one row per world."""
-
-    def with_worlds(self, worlds: BoolArray, other: Self) -> Self:
-        """These values with those of another in some worlds, a (num_worlds,) mask."""
-        chosen = {}
-        for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
-            mine = getattr(self, name)
-            chosen[name] = np.where(worlds.reshape(-1, *[1] * (mine.ndim - 1)), getattr(other, name), mine)
-        return type(self)(**chosen)
-
-
 @dataclass(frozen=True)
-class WalkState(_Rows):
+class WalkState(Rows):
     """The true state, n rows.
 
     Attributes:
         theta, theta_dot, q, q_dot: Motor and link side, (n, 12).
-        pelvis, pelvis_R: Pose of the pelvis, (n, 3), (n, 3, 3).
+        pelvis, quaternion: Pose of the pelvis, (n, 3) [m], (n, 4).
         attitude: Roll, pitch and tilt of the pelvis, (n, 3) [rad].
         rate: Angular velocity of the pelvis in its own frame, (n, 3) [rad/s].
         ankles: Positions of the ankles, (n, 2, 3) [m].
@@ -69,7 +59,7 @@ class WalkState(_Rows):
     q: Array
     q_dot: Array
     pelvis: Array
-    pelvis_R: Array
+    quaternion: Array
     attitude: Array
     rate: Array
     ankles: Array
@@ -83,27 +73,50 @@ class WalkState(_Rows):
         """A state to be overwritten."""
         theta, theta_dot, q, q_dot, torque = np.zeros((5, n, _JOINTS))
         return cls(
-            theta=theta, theta_dot=theta_dot, q=q, q_dot=q_dot, pelvis=np.zeros((n, 3)), pelvis_R=np.zeros((n, 3, 3)),
+            theta=theta, theta_dot=theta_dot, q=q, q_dot=q_dot, pelvis=np.zeros((n, 3)), quaternion=np.zeros((n, 4)),
             attitude=np.zeros((n, 3)), rate=np.zeros((n, 3)), ankles=np.zeros((n, 2, 3)),
             wrench=np.zeros((n, _WRENCHES)), force=np.zeros((n, 2)), zmp=np.zeros((n, 2)), servo_torque=torque,
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class WalkMeasurement(_Rows):
-    """Sensor values, n rows; the encoders also a control period earlier. Units and shapes as in `WalkState`."""
+class WalkMeasurement(Rows):
+    """Sensor values, n rows.
+
+    Attributes:
+        encoder, encoder_before: Now and a control period earlier, (n, 12) [rad].
+        body: IMU attitude and rate, and foot wrenches, (n, 17), in the columns `ATTITUDE`, `RATE` and `WRENCH`.
+    """
 
     encoder: Array
     encoder_before: Array
-    attitude: Array
-    rate: Array
-    wrench: Array
+    body: Array
 
     @classmethod
     def zeros(cls, n: int) -> "WalkMeasurement":
         """A measurement to be overwritten."""
         encoder, before = np.zeros((2, n, _JOINTS))
-        return cls(encoder, before, np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, _WRENCHES)))
+        return cls(encoder, before, np.zeros((n, WRENCH.stop)))
+
+
+@dataclass(frozen=True)
+class WalkSample(Rows):
+    """What a step is scored by, n rows.
+
+    Attributes:
+        step: Control steps since the start of the episode, (n,).
+        state: The true state.
+        offset, offset_before: Command offsets of the last control period and of the one before, (n, 12) [rad].
+        stiffness: True K, (n, 12) [N·m/rad].
+        contact_since: Step since which the swing foot has been on the ground, (n,); negative where it is not.
+    """
+
+    step: IntArray
+    state: WalkState
+    offset: Array
+    offset_before: Array
+    stiffness: Array
+    contact_since: IntArray
 
 
 def rms(values: Array) -> Array:
@@ -121,9 +134,13 @@ def rotation_of(quaternion: Array) -> Array:
     return R
 
 
-def attitude_of(R: Array) -> Array:
-    """Roll and pitch (of yaw, pitch, roll) and the angle between z axis and vertical, (n, 3, 3) to (n, 3) [rad]."""
-    roll = np.arctan2(R[:, 2, 1], R[:, 2, 2])
-    pitch = -np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0))
-    tilt = np.arctan2(np.hypot(R[:, 0, 2], R[:, 1, 2]), R[:, 2, 2])
-    return np.stack([roll, pitch, tilt], axis=-1)
+def attitude_of(quaternion: Array) -> Array:
+    """Roll and pitch (of yaw, pitch, roll) and the angle between z axis and vertical, (n, 4) to (n, 3) [rad]."""
+    w, x, y, z = quaternion.T
+    # the vertical in the frame of the pelvis
+    up_x, up_y, up_z = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    attitude = np.empty((3, len(quaternion)))
+    np.arctan2(up_y, up_z, out=attitude[0])
+    np.arcsin(np.minimum(np.maximum(-up_x, -1.0), 1.0), out=attitude[1])
+    np.arctan2(np.hypot(up_x, up_y), up_z, out=attitude[2])
+    return attitude.T

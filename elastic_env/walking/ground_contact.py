@@ -10,29 +10,37 @@ taken about the origin on the ground, the ZMP is
 import numpy as np
 
 from elastic_env.signals import Array
-from elastic_env.vectors import cross, rotated
 
 
-def ground_wrench(
-    force: Array, moment: Array, foot_R: Array, foot_mass: Array, foot_com: Array, gravity: Array
-) -> tuple[Array, Array]:
-    """Force and moment of the ground on each foot, about its ankle, of feet that hardly accelerate.
+class FootSensors:
+    """Force-torque sensors at the ankles of feet that hardly accelerate.
 
     Args:
-        force: Sensor, on the leg, in the frame of the foot, (..., L, 3) [N].
-        moment: Sensor, about the ankle, likewise [N·m].
-        foot_R: Orientation of the feet, (..., L, 3, 3).
         foot_mass: (L,) [kg].
         foot_com: Center of mass of the feet from the ankle, in the frame of the foot, (L, 3) [m].
-        gravity: Acceleration of gravity in the frame that foot_R leads to, (..., 3) [m/s²].
-
-    Returns:
-        Force and moment in that frame, (..., L, 3) each [N], [N·m].
+        gravity: Acceleration of gravity in the world, (3,) [m/s²].
     """
-    weight = foot_mass[:, None] * gravity[..., None, :]
-    f = rotated(foot_R, force) - weight
-    n = rotated(foot_R, moment) - cross(rotated(foot_R, foot_com), weight)
-    return f, n
+
+    def __init__(self, foot_mass: Array, foot_com: Array, gravity: Array) -> None:
+        self._com = foot_com
+        self._weight = foot_mass[:, None] * gravity
+        self._turning = np.cross(np.eye(3), self._weight[:, None])  # x @ this is x × weight
+
+    def ground_wrench(self, sensors: Array, foot_R: Array) -> tuple[Array, Array]:
+        """Force and moment of the ground on each foot, about its ankle, in the world.
+
+        Args:
+            sensors: Force and moment on the leg about the ankle, in the frame of the foot, (n, L, 2, 3) [N], [N·m].
+            foot_R: Orientation of the feet, (n, L, 3, 3).
+
+        Returns:
+            (n, L, 3) each [N], [N·m].
+        """
+        vectors = np.empty((*foot_R.shape[:-2], 3, 3))
+        vectors[..., :2, :], vectors[..., 2, :] = sensors, self._com
+        seen = vectors @ foot_R.swapaxes(-1, -2)
+        turned = seen[..., 2:, :] @ self._turning
+        return seen[..., 0, :] - self._weight, seen[..., 1, :] - turned[..., 0, :]
 
 
 def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float) -> Array:
@@ -47,14 +55,16 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
     Returns:
         (..., 2) [m]; nan where the feet are not loaded.
     """
-    about_origin = _over_feet(cross(ankle, force) + moment)
-    vertical = _over_feet(force)[..., 2]
-    loaded = vertical >= least_n
-    scale = np.where(loaded, vertical, 1.0)
-    zmp = np.stack([-about_origin[..., 1], about_origin[..., 0]], axis=-1) / scale[..., None]
-    return np.where(loaded[..., None], zmp, np.nan)
+    about_x = ankle[..., 1] * force[..., 2] - ankle[..., 2] * force[..., 1] + moment[..., 0]
+    about_y = ankle[..., 2] * force[..., 0] - ankle[..., 0] * force[..., 2] + moment[..., 1]
+    vertical = _over_feet(force[..., 2])
+    scale = np.where(vertical >= least_n, vertical, np.nan)
+    zmp = np.empty((*vertical.shape, 2))
+    np.divide(-_over_feet(about_y), scale, out=zmp[..., 0])
+    np.divide(_over_feet(about_x), scale, out=zmp[..., 1])
+    return zmp
 
 
-def _over_feet(vectors: Array) -> Array:
-    """Sum over the two feet, (..., 2, 3) to (..., 3)."""
-    return vectors[..., 0, :] + vectors[..., 1, :]
+def _over_feet(values: Array) -> Array:
+    """Sum over the two feet, (..., 2) to (...)."""
+    return values[..., 0] + values[..., 1]

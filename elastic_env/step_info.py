@@ -1,0 +1,117 @@
+"""The info of a step, most of which nobody may ever look at."""
+
+from collections.abc import Callable, ItemsView, Iterator, KeysView, ValuesView
+from typing import Any
+
+
+class StepInfo(dict[str, Any]):
+    """A dictionary part of which is computed when it is first needed.
+
+    Looking at a key that is given from the start costs nothing; anything else computes the rest, once.
+
+    Args:
+        given: What is known.
+        rest: Makes the rest, without any of the given keys; it must not depend on when it is called.
+    """
+
+    def __init__(self, given: dict[str, Any], rest: Callable[[], dict[str, Any]]) -> None:
+        super().__init__(given)
+        self._rest: Callable[[], dict[str, Any]] | None = rest
+
+    def complete(self) -> dict[str, Any]:
+        """A plain dictionary with everything."""
+        self._settle()
+        return dict(super().items())
+
+    def _settle(self) -> None:
+        if self._rest is not None:
+            rest, self._rest = self._rest, None
+            for key, value in rest().items():
+                super().setdefault(key, value)
+
+    def __missing__(self, key: str) -> Any:
+        if self._rest is None:
+            raise KeyError(key)
+        self._settle()
+        return self[key]
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """As `dict.get`."""
+        self._settle()
+        return super().get(key, default)
+
+    def __contains__(self, key: object) -> bool:
+        if not super().__contains__(key):
+            self._settle()
+        return super().__contains__(key)
+
+    def __iter__(self) -> Iterator[str]:
+        self._settle()
+        return super().__iter__()
+
+    def __len__(self) -> int:
+        self._settle()
+        return super().__len__()
+
+    def keys(self) -> KeysView[str]:  # type: ignore[override]
+        """As `dict.keys`."""
+        self._settle()
+        return super().keys()
+
+    def values(self) -> ValuesView[Any]:  # type: ignore[override]
+        """As `dict.values`."""
+        self._settle()
+        return super().values()
+
+    def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
+        """As `dict.items`."""
+        self._settle()
+        return super().items()
+
+    def pop(self, *args: Any) -> Any:
+        """As `dict.pop`."""
+        self._settle()
+        return super().pop(*args)
+
+    def popitem(self) -> tuple[str, Any]:
+        """As `dict.popitem`."""
+        self._settle()
+        return super().popitem()
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        """As `dict.setdefault`."""
+        self._settle()
+        return super().setdefault(key, default)
+
+    def __delitem__(self, key: str) -> None:
+        self._settle()
+        super().__delitem__(key)
+
+    def clear(self) -> None:
+        """As `dict.clear`."""
+        self._rest = None
+        super().clear()
+
+    def copy(self) -> dict[str, Any]:
+        """A plain dictionary with everything."""
+        return self.complete()
+
+    def __or__(self, other: Any) -> Any:
+        return self.complete() | dict(other)
+
+    def __ror__(self, other: Any) -> Any:
+        return dict(other) | self.complete()
+
+    def __eq__(self, other: object) -> bool:
+        return self.complete() == (other.complete() if isinstance(other, StepInfo) else other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return repr(self.complete())
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return dict, (self.complete(),)
