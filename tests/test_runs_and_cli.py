@@ -600,6 +600,27 @@ def test_play_writes_mp4() -> None:
     assert Path("deep/x.mp4").read_bytes()[4:8] == b"ftyp"
 
 
+@pytest.mark.parametrize(("max_s", "steps"), [(0.001, 1), (0.012, 3), (float("inf"), 375)])
+def test_play_takes_one_step_at_least_and_the_episode_at_most(
+    max_s: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a film without a picture, which is announced and not there, and a time without end that is none."""
+    played = []
+
+    def film(env: Any, episode: Any, total: int, *_: Any) -> None:
+        played.append((total, len(list(episode))))
+
+    monkeypatch.setattr("train.play._film", film)
+    play(condition(), Console(quiet=True), Path("x.gif"), max_s=max_s)
+    assert played == [(steps, steps)]
+
+
+def test_play_films_a_time_shorter_than_a_control_step() -> None:
+    """Catches a film that is announced and not there."""
+    play(condition(), Console(quiet=True), Path("x.mp4"), max_s=0.001)
+    assert Path("x.mp4").stat().st_size > 0
+
+
 @pytest.mark.usefixtures("in_process")
 def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
