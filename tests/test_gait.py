@@ -114,8 +114,12 @@ def test_a_duration_between_control_steps_is_an_error(name: str) -> None:
         r"the nearest are 0\.5 s and 0\.504 s$",
     ):
         timed(gait)
-    with pytest.raises(ConfigurationError, match=rf"^{name} must be a multiple .* got 0\.001 s; .* 0\.004 s"):
+    with pytest.raises(
+        ConfigurationError, match=rf"^{name} must be a multiple .* got 0\.001 s; the nearest is 0\.004 s$"
+    ):
         timed(gait.replace(**{name: 0.001}))
+    with pytest.raises(ConfigurationError, match=r"the nearest are 2000 s and 2000\.004 s$"):
+        timed(gait.replace(**{name: 2000.001}))
 
 
 @pytest.mark.parametrize("given", [2, 2.0, "fast", None, float("nan"), (), (0.5, 0.6), [0.5, 0.6, 0.5, 0.6], True])

@@ -196,9 +196,9 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
     steps = duration_s / control_period_s
     if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        below, above = (max(bound, 1) * control_period_s for bound in (int(np.floor(steps)), int(np.ceil(steps))))
+        nearest = sorted({max(int(bound), 1) * control_period_s for bound in (np.floor(steps), np.ceil(steps))})
         raise ConfigurationError(
             f"{name} must be a multiple of the control period of {control_period_s} s, got {duration_s} s; "
-            f"the nearest are {below:g} s and {above:g} s"
+            f"the nearest {'is' if len(nearest) == 1 else 'are'} {' and '.join(f'{bound:.10g} s' for bound in nearest)}"
         )
     return round(steps)
