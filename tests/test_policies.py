@@ -256,12 +256,15 @@ def test_scenario_changes_the_true_stiffness() -> None:
     assert scalar(scenario="soft").unwrapped.truth().model.stiffness == pytest.approx([700.7])
 
 
-@pytest.mark.parametrize("kind", ["float", "int", "list", "path", "text"])
+@pytest.mark.parametrize("kind", ["float", "int", "list", "path", "text", "numpy", "array"])
 def test_stiffness_can_be_a_number_a_list_or_an_identification(kind: str, tmp_path: Path) -> None:
     """Catches an option that is read but not used, or that only some types reach."""
     path = tmp_path / "identification.json"
     path.write_text(json.dumps({"stiffness_nm_per_rad": 640.0, "points": 12}))
-    given = {"float": 640.0, "int": 640, "list": [640.0], "path": path, "text": str(path)}[kind]
+    given = {
+        "float": 640.0, "int": 640, "list": [640.0], "path": path, "text": str(path), "numpy": np.float32(640.0),
+        "array": np.array([640]),
+    }[kind]  # fmt: skip
     action, q_ref = compensation(scalar(), stiffness=given)
     assert action == np.float32(60.0 * np.sin(q_ref) / 640.0)
 
@@ -270,6 +273,13 @@ def test_stiffness_of_the_environment_is_the_one_that_input_assumes() -> None:
     """Catches `stiffness=` that changes the plant alone."""
     action, q_ref = compensation(scalar(stiffness=300.0))
     assert action == np.float32(60.0 * np.sin(q_ref) / 300.0)
+
+
+@pytest.mark.parametrize("value", [["900"], [True], np.array(["900"]), True, [[900.0], [1.0, 2.0]]])
+def test_stiffness_that_is_no_number_is_an_error(value: object) -> None:
+    """Catches text and truth that NumPy converts."""
+    with pytest.raises(ConfigurationError, match=r"stiffness must be (a )?numbers? \[N·m/rad\]"):
+        baselines.make("input", scalar(), stiffness=value)
 
 
 @pytest.mark.parametrize("value", [-5.0, 0.0, np.nan, np.inf])

@@ -11,7 +11,7 @@ import yaml
 from rich.console import Console
 from rich.markup import escape
 
-from elastic_env.config import load_yaml
+from elastic_env.config import load_yaml, parse_yaml
 from elastic_env.errors import ConfigurationError, ElasticError
 
 _CONSOLE = Console()
@@ -240,7 +240,7 @@ def _motion(env: str, text: str | None) -> Any:
     if text is None:
         return default
     try:
-        value = yaml.safe_load(text)
+        value = parse_yaml(text)
     except yaml.YAMLError:
         raise ConfigurationError(
             f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "

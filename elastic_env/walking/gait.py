@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from elastic_env.config import Model, quantity
+from elastic_env.config import Model, plain_numbers, quantity
 from elastic_env.errors import ConfigurationError
 from elastic_env.plan import STAND_S, control_times, quintic
 from elastic_env.signals import Array, BoolArray, IntArray
@@ -73,13 +73,11 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
     """
     if isinstance(step_period, Gait):
         return step_period.replace(**parameters) if parameters else step_period
-    if isinstance(step_period, tuple | list):
-        durations = tuple(step_period)
-    else:
-        try:
-            durations = STEP_DURATIONS.get(float(step_period), ())
-        except (TypeError, ValueError):
-            durations = ()
+    period, durations = plain_numbers(step_period), ()
+    if isinstance(period, tuple | list):
+        durations = tuple(period)
+    elif isinstance(period, int | float):
+        durations = STEP_DURATIONS.get(period, ())
     if len(durations) != 3:
         known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
         raise ConfigurationError(
