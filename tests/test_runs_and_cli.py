@@ -337,18 +337,20 @@ def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(capsys: pytes
 
 
 @pytest.mark.usefixtures("in_process")
-def test_evaluate_hands_the_stiffness_of_a_file_to_the_policy() -> None:
+def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
     """Catches an option that is read and forgotten: a policy that believes in 2 K compensates half the deflection."""
     Path("identification.json").write_text('{"stiffness_nm_per_rad": 2002.0}')
     reference = "{kind: sine, middle: 0.5, amplitude: 0.005, duration_s: 0.1, onset_s: 0.2}"
     arguments = ["evaluate", "--reference", reference, "--scenario", "ideal"]
-    for more in (["--stiffness", "identification.json"], ["--stiffness", "2002"], [], ["--policy", "uncompensated"]):
+    for stiffness in ("identification.json", "2002", "[2002.0]"):
+        main([*arguments, "--stiffness", stiffness])
+    for more in ([], ["--policy", "uncompensated"]):
         main([*arguments, *more])
-    folders = ["evaluate", "evaluate-2", "evaluate-3", "evaluate-4"]
+    folders = ["evaluate", "evaluate-2", "evaluate-3", "evaluate-4", "evaluate-5"]
     rms = [float(rows_of(Path("runs") / f / "episodes.csv")[0]["link_error_rms_rad"]) for f in folders]
-    assert rms[0] == rms[1]
-    assert rms[0] == pytest.approx(0.5 * rms[3], rel=0.05)
-    assert rms[2] < 0.05 * rms[3]
+    assert rms[0] == rms[1] == rms[2]
+    assert rms[0] == pytest.approx(0.5 * rms[4], rel=0.05)
+    assert rms[3] < 0.05 * rms[4]
 
 
 @pytest.mark.usefixtures("in_process")
@@ -460,6 +462,12 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "episodes": (["evaluate", "--episodes", "0"], ["episodes", ">= 1"]),
     "seed": (["evaluate", "--seed", "-1"], ["seed", ">= 0", "-1"]),
     "assumed": (["evaluate", "--stiffness", "-5"], ["stiffness", "> 0", "[N·m/rad]", "-5"]),
+    "assumed list": (
+        ["evaluate", "--stiffness", "[1001, 1001]"],
+        ["stiffness", "one number or 1", "[N·m/rad]", "(2,)"],
+    ),
+    "assumed text": (["evaluate", "--stiffness", "[soft]"], ["stiffness must be numbers", "'soft'"]),
+    "assumed nan": (["evaluate", "--stiffness", "nan"], ["stiffness", "> 0", "nan"]),
     "assumed file": (["evaluate", "--stiffness", "none.json"], ["none.json"]),
     "missing file": (["compare", "none.yaml"], ["none.yaml"]),
     "brackets": (["compare", "[/bold].yaml"], ["[/bold].yaml"]),
@@ -515,6 +523,7 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
         (["--help"], ["identify", "evaluate", "compare", "speed", "play"]),
         (["evaluate", "--help"], ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"]),
         (["evaluate", "--help"], ["walker", "input_wrench", "step_period", "num_steps", "push"]),
+        (["evaluate", "--help"], ["a list of one per joint", "twelve on the walker", "identification.json"]),
         (["play", "--help"], ["walker", "--reference", ".mp4"]),
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
         (["compare", "--help"], ["configs/", "episodes.csv", "--jobs"]),

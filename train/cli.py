@@ -78,7 +78,8 @@ class Evaluate:
     seed: int = 0
     """Seed of the first episode."""
     stiffness: str | None = None
-    """K that the policy assumes: a number [N·m/rad] or the path of an identification.json."""
+    """K that the policy assumes: a number [N·m/rad], a list of one per joint
+    such as '[1001]', twelve on the walker, or the path of an identification.json."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
 
@@ -87,7 +88,7 @@ class Evaluate:
         from train.compare import CompareConfig, compare
         from train.conditions import PolicySpec
 
-        options = {} if self.stiffness is None else {"stiffness": _number_or_path(self.stiffness)}
+        options = {} if self.stiffness is None else {"stiffness": _stiffness(self.stiffness)}
         config = CompareConfig(
             name="evaluate", env=self.env, references=[_motion(self.env, self.reference)], scenarios=[self.scenario],
             policies=[PolicySpec(name=self.policy, options=options)], episodes=self.episodes, seed=self.seed,
@@ -249,11 +250,13 @@ def _motion(env: str, text: str | None) -> Any:
     return value if isinstance(value, int | float | list | dict) else text
 
 
-def _number_or_path(text: str) -> float | str:
+def _stiffness(text: str) -> float | list[Any] | str:
+    """A stiffness as it is written: a number, a list of numbers, or else the path of a file."""
     try:
-        return float(text)
-    except ValueError:
+        value = parse_yaml(text)
+    except yaml.YAMLError:
         return text
+    return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
 
 
 def _print_files(comparison: Any) -> None:
