@@ -405,10 +405,13 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "policy's environment option": (
         {"name": "c", "policies": [{"name": "zero", "env_options": {"from": "rigid"}}]}, ["'from'", "form", "stiffness"]
     ),
-    "reserved option": ({"name": "c", "env_options": {"step_period": 3}}, ["step_period", "keys of their own"]),
+    "reserved option": ({"name": "c", "env_options": {"step_period": 3}}, ["step_period cannot", "key", "of its own"]),
     "reserved parameter": (
         {"name": "c", "env": "walker", "references": [{"step_period": 3, "scenario": "ideal"}]},
-        ["scenario", "reference"],
+        ["references.0: scenario cannot be part of a reference; it has a key"],
+    ),
+    "unplaced parameter": (
+        {"name": "c", "references": [{"kind": "sine", "num_envs": 3}]}, ["num_envs cannot", "set it themselves"]
     ),
     "no reference": ({"name": "c", "references": [None]}, ["reference", "name", "mapping", "None"]),
     "policy of the figures": ({"name": "c", "figure_policies": ["inptu"]}, ["'inptu'", "uncompensated", "input"]),
@@ -459,8 +462,13 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["'steps'", "num_steps", "gait"],
     ),
     "walk policy": (["evaluate", "--env", "walker", "--policy", "inptu"], ["'inptu'", "input_output", "input_wrench"]),
-    "episodes": (["evaluate", "--episodes", "0"], ["episodes", ">= 1"]),
-    "seed": (["evaluate", "--seed", "-1"], ["seed", ">= 0", "-1"]),
+    "episodes": (["evaluate", "--episodes", "0"], ["error: --episodes must be", ">= 1"]),
+    "seed": (["evaluate", "--seed", "-1"], ["error: --seed must be", ">= 0", "-1"]),
+    "both": (["evaluate", "--seed", "-1", "--episodes", "0"], ["--episodes must be", "\n--seed must be"]),
+    "reserved": (
+        ["evaluate", "--env", "walker", "--reference", "{step_period: 3, scenario: ideal}"],
+        ["error: --reference: scenario cannot be part of a reference; it has a key, or an option, of its own"],
+    ),
     "assumed": (["evaluate", "--stiffness", "-5"], ["stiffness", "> 0", "[N·m/rad]", "-5"]),
     "assumed list": (
         ["evaluate", "--stiffness", "[1001, 1001]"],
@@ -473,16 +481,17 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "brackets": (["compare", "[/bold].yaml"], ["[/bold].yaml"]),
     "jobs": (["compare", "good.yaml", "--jobs", "-1"], ["jobs", "-1"]),
     "identify scenario": (["identify", "--scenario", "sof"], ["'sof'", "soft"]),
-    "identify seed": (["identify", "--seed", "-1"], ["seed", "-1"]),
+    "identify seed": (["identify", "--seed", "-1"], ["--seed must be", "-1"]),
     "identify K": (["identify", "--stiffness", "-1"], ["stiffness", "> 0", "[N·m/rad]"]),
     "identify positions": (["identify", "--positions", "4"], ["positions", ">= 5", "4"]),
     "identify masses": (["identify", "--second-mass", "0"], ["mass", "> 0"]),
     "identify equal masses": (["identify", "--second-mass", "1"], ["mass"]),
     "play scenario": (["play", "--scenario", "sof", "--video", "x.gif"], ["'sof'", "soft"]),
+    "play seed": (["play", "--seed", "-1", "--video", "x.gif"], ["error: --seed must be", "-1"]),
     "play environment": (["play", "--env", "wlaker", "--video", "x.gif"], ["'wlaker'", "testbed", "walker"]),
     "play format": (["play", "--video", "x.txt", "--max-s", "0.1"], [".mp4", ".gif", "x.txt"]),
     "play time": (["play", "--video", "x.gif", "--max-s", "-1"], ["max", "-1"]),
-    "speed worlds": (["speed", "--num-envs", "0"], ["num_envs", "0"]),
+    "speed worlds": (["speed", "--num-envs", "0"], ["error: --num-envs must be", "0"]),
     "speed steps": (["speed", "--num-envs", "2", "--steps", "0"], ["steps", "0"]),
     "speed environment": (["speed", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
     "speed policy": (["speed", "--num-envs", "2", "--policy", "inptu"], ["'inptu'", "input", "oracle"]),

@@ -1,7 +1,10 @@
 """The command `elastic`: identify, evaluate, compare, speed, play, demo."""
 
 import os
+import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,7 +48,8 @@ class Identify:
         """Identify, write, print."""
         from train.identify import IdentifyConfig, run_identification
 
-        config = IdentifyConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+        with _options_named():
+            config = IdentifyConfig(**{name: value for name, value in vars(self).items() if name != "output"})
         run_identification(config, _CONSOLE, self.output)
 
 
@@ -89,10 +93,12 @@ class Evaluate:
         from train.conditions import PolicySpec
 
         options = {} if self.stiffness is None else {"stiffness": _stiffness(self.stiffness)}
-        config = CompareConfig(
-            name="evaluate", env=self.env, references=[_motion(self.env, self.reference)], scenarios=[self.scenario],
-            policies=[PolicySpec(name=self.policy, options=options)], episodes=self.episodes, seed=self.seed,
-        )  # fmt: skip
+        with _options_named():
+            config = CompareConfig(
+                name="evaluate", env=self.env, references=[_motion(self.env, self.reference)],
+                scenarios=[self.scenario], policies=[PolicySpec(name=self.policy, options=options)],
+                episodes=self.episodes, seed=self.seed,
+            )  # fmt: skip
         _print_files(compare(config, _CONSOLE, self.output))
 
 
@@ -148,7 +154,8 @@ class Speed:
         """Measure and report."""
         from train.speed import SpeedConfig, measure_all
 
-        config = SpeedConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+        with _options_named():
+            config = SpeedConfig(**{name: value for name, value in vars(self).items() if name != "output"})
         _CONSOLE.print(f"wrote {measure_all(config, _CONSOLE, self.output)}", soft_wrap=True)
 
 
@@ -184,10 +191,11 @@ class Play:
         from train.play import play
 
         reference = "sine" if self.reference is None and self.env == "testbed" else self.reference
-        condition = Condition(
-            env=self.env, policy=PolicySpec(name=self.policy), reference=_motion(self.env, reference),
-            scenario=self.scenario, seed=self.seed,
-        )  # fmt: skip
+        with _options_named():
+            condition = Condition(
+                env=self.env, policy=PolicySpec(name=self.policy), reference=_motion(self.env, reference),
+                scenario=self.scenario, seed=self.seed,
+            )  # fmt: skip
         play(condition, _CONSOLE, self.video, self.max_s)
 
 
@@ -231,6 +239,19 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")
         os._exit(130)  # worker processes must not keep the terminal waiting
+
+
+_PARAMETER = re.compile(r"^(?:(?:\w+Config|Condition)\.(\w+)|(reference)s?)(?:\.\d+)?(?=:| must be )", re.MULTILINE)
+
+
+@contextmanager
+def _options_named() -> Iterator[None]:
+    """Errors of a configuration that is made from options name the options in place of its parameters."""
+    try:
+        yield
+    except ConfigurationError as error:
+        named = _PARAMETER.sub(lambda found: "--" + (found[1] or found[2]).replace("_", "-"), str(error))
+        raise ConfigurationError(named) from None
 
 
 def _motion(env: str, text: str | None) -> Any:

@@ -9,8 +9,10 @@ from elastic_env.errors import ConfigurationError, unknown_name
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
 
-RESERVED = ("scenario", "num_envs", "num_threads", "autoreset_mode", "render_mode")
-"""Arguments of the environments that have keys of their own, or no place in a comparison."""
+UNPLACED = ("num_envs", "num_threads", "autoreset_mode", "render_mode")
+"""Arguments of the environments that have no place in a comparison."""
+RESERVED = ("scenario", *UNPLACED)
+"""These, and the argument that has a key of its own."""
 
 _UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
 
