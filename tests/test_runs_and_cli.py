@@ -422,6 +422,10 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "swept option": (
         {"name": "c", "sweep": {"option": "stiffnes", "values": [1, 2]}}, ["'stiffnes'", "stiffness_scale"]
     ),
+    "swept in vain": (
+        {"name": "c", "sweep": {"option": "stiffness_scale", "values": [1, 2]}},
+        ["'uncompensated' of the testbed does not use stiffness_scale", "it has no options", "level: true"],
+    ),
     "stiffness": ({"name": "c", "env_options": {"stiffness": -3}}, ["stiffness", "> 0", "[N·m/rad]", "-3"]),
     "no mapping": (["input"], ["mapping", "list"]),
 }  # fmt: skip
