@@ -320,6 +320,9 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
     row = next(line for line in table.export_text().splitlines() if "input" in line)
     assert "2.00" in row
     assert "2/4" in row
+    assert train.summary.failure_notes([Evaluation(condition(), episodes)]) == []
+    failed = Evaluation(condition(), [episode for episode in episodes if episode["termination"]])
+    assert train.summary.failure_notes([failed]) == ["input: diverged (2 of 2)"]  # the testbed keeps no time of it
 
 
 @pytest.mark.usefixtures("in_process")

@@ -27,7 +27,7 @@ from train.compare import CompareConfig, try_out
 from train.conditions import Condition, PolicySpec
 from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
-from train.summary import print_summary, summary_table, write_summary
+from train.summary import failure_notes, print_summary, summary_table, write_summary
 from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.sweep_plots import draw_sweep
 from train.walk_plots import draw_pelvis, draw_zmp, intervals
@@ -216,6 +216,32 @@ def test_a_fall_is_counted_and_not_scored(fallen: Evaluation) -> None:
 
 
 # Tables.
+
+
+def test_a_fall_of_all_says_when(fallen: Evaluation, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a policy of which nothing is known but that it fell, a mean of the times, and one of some that fell."""
+    several, some = (made_up(walk(p, episodes=3), *[(end, 0.1) for end in ends]) for p, ends in FALLS.items())
+    for cell in (several, some):
+        for episode, time in zip(cell.episodes, (3.42, 3.31, 9.0), strict=True):
+            episode["duration_s"] = time
+    time = fallen.trace["time_s"][-1]
+    notes = ["zero: fell after 3.4 s (3 of 3)"]
+    assert failure_notes([several, some]) == notes
+    assert failure_notes([fallen]) == [f"zero: fell after {time:.1f} s (1 of 1)"]
+    other = made_up(walk("zero", scenario="soft"), ("fell", 0.1))
+    other.episodes[0]["duration_s"] = 2.0
+    name = several.condition.reference_name
+    assert failure_notes([several, other]) == [
+        f"{name}, nominal, {notes[0]}",
+        f"{name}, soft, zero: fell after 2.0 s (1 of 1)",
+    ]
+    print_summary([several, some], Console(width=100))
+    assert notes[0] in capsys.readouterr().out.splitlines()
+    assert f"* {notes[0]}" in write_summary([several, some], Path("summary.md")).read_text().splitlines()
+    assert "failed:" not in write_summary([some], Path("summary.md")).read_text()
+
+
+FALLS = {"zero": ("fell", "fell", "fell"), "input": ("fell", "", "fell")}
 
 
 def test_tables_say_median_worst_and_falls() -> None:

@@ -41,9 +41,9 @@ class Evaluation:
     points: StaticPoints | None = None
     rest_references: Array = field(default_factory=lambda: np.zeros(0))
 
-    def values(self, metric: str) -> Array:
-        """A metric over the episodes that did not fail, (n,); empty where none of them has it."""
-        found = [episode.get(metric) for episode in self.episodes if not episode["termination"]]
+    def values(self, metric: str, failed: bool = False) -> Array:
+        """A metric over the episodes that did not fail, or over those that did, (n,); empty where none has it."""
+        found = [episode.get(metric) for episode in self.episodes if bool(episode["termination"]) == failed]
         return np.array([value for value in found if value is not None], dtype=np.float64)
 
     @property
