@@ -662,7 +662,7 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch.setattr(train.demo, "_WALK", train.demo._WALK.replace(references=[short_walk]))
     main(["demo"])
     printed = capsys.readouterr().out
-    walks = {"pelvis_0.3+0.5+0.3_s_nominal.png", "zmp_0.3+0.5+0.3_s_nominal.png"}
+    walks = {"pelvis_0.3+0.5+0.3_s_num_steps=1_nominal.png", "zmp_0.3+0.5+0.3_s_num_steps=1_nominal.png"}
     names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json", *walks}
     names |= {"episodes.csv", "summary.md"}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}

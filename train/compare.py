@@ -105,7 +105,7 @@ class CompareConfig(Model):
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
         return [
-            " ".join([kind, *_parameters(reference, known)]) if kinds.count(kind) > 1 else None
+            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)])) if kinds.count(kind) > 1 else None
             for kind, reference in zip(kinds, self.references, strict=True)
         ]
 
