@@ -4,7 +4,7 @@ Compensation is a wrapper: `Compensated(policy, compensator)` adds the input com
 and shows it compensated encoder readings. The named policies are such compositions.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from baselines.compensated import Compensated
@@ -72,37 +72,37 @@ def _open(build: Builder) -> Builder:
 
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-    for name in ("stiffness", "stiffness_scale"):
-        if getattr(options, name) != PolicyOptions.model_fields[name].default:
-            raise ConfigurationError(
-                f"the oracle knows the true stiffness, got {name}={getattr(options, name)!r}; leave it out"
-            )
     if isinstance(model, WalkerModel):
         controller = _controller(env, env.unwrapped.truth().model, options)
         return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)
     return Oracle(env, _zero(env, model, options), options.ramp_s)
 
 
-_ON_THE_TESTBED: dict[str, Builder] = {
-    "zero": _zero,
-    "uncompensated": _zero,
-    "input": _around_zero(GravityCompensator),
-    "dynamic": _around_zero(DynamicCompensator),
-    "oracle": _oracle,
-}
-"""On the testbed `uncompensated` has no controller to add and equals `zero`."""
+_ASSUMED = ("stiffness", "stiffness_scale")
+_COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
+_CONTROLLER = ("gains", "com_feedback")
 
-_ON_THE_WALKER: dict[str, Builder] = {
-    "zero": _zero,
-    "uncompensated_open": _open(_controller),
-    "uncompensated": _controller,
-    "input_open": _open(_around_controller(GravityCompensator, "none")),
-    "input": _around_controller(GravityCompensator, "none"),
-    "input_output": _around_controller(GravityCompensator, "taylor"),
-    "input_wrench": _around_controller(GravityCompensator, "wrench"),
-    "dynamic": _around_controller(DynamicCompensator, "wrench"),
-    "oracle": _oracle,
+_ON_THE_TESTBED: dict[str, tuple[Builder, tuple[str, ...]]] = {
+    "zero": (_zero, ()),
+    "uncompensated": (_zero, ()),
+    "input": (_around_zero(GravityCompensator), _COMPENSATOR),
+    "dynamic": (_around_zero(DynamicCompensator), _COMPENSATOR),
+    "oracle": (_oracle, ("ramp_s",)),
 }
+"""How each is built, and its options. On the testbed `uncompensated` has no controller to add and equals `zero`."""
+
+_ON_THE_WALKER: dict[str, tuple[Builder, tuple[str, ...]]] = {
+    "zero": (_zero, ()),
+    "uncompensated_open": (_open(_controller), (*_ASSUMED, "gains", "ramp_s")),
+    "uncompensated": (_controller, (*_ASSUMED, *_CONTROLLER, "ramp_s")),
+    "input_open": (_open(_around_controller(GravityCompensator, "none")), (*_COMPENSATOR, "gains")),
+    "input": (_around_controller(GravityCompensator, "none"), (*_COMPENSATOR, *_CONTROLLER)),
+    "input_output": (_around_controller(GravityCompensator, "taylor"), (*_COMPENSATOR, *_CONTROLLER)),
+    "input_wrench": (_around_controller(GravityCompensator, "wrench"), (*_COMPENSATOR, *_CONTROLLER)),
+    "dynamic": (_around_controller(DynamicCompensator, "wrench"), (*_COMPENSATOR, *_CONTROLLER)),
+    "oracle": (_oracle, (*_CONTROLLER, "ramp_s")),
+}
+"""The same. The controller alone assumes K too, for the ankles' offsets and the friction."""
 
 
 def policy_names() -> list[str]:
@@ -127,13 +127,14 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     Args:
         name: As in the table.
         env: The environment, scalar or vector, wrapped or not; it provides the assumed model.
-        **options: Parameters of `PolicyOptions`, such as stiffness, output, gravity, com_feedback, gains.
+        **options: Parameters of `PolicyOptions`, such as stiffness, output, gravity, com_feedback, gains, those that
+            have an effect on this policy in this environment; None is as if it were not given.
 
     Returns:
         An object with `predict`, usable on scalar and vector environments and in SB3's `evaluate_policy`.
 
     Raises:
-        ConfigurationError: Unknown name or option, or an environment that is not ours.
+        ConfigurationError: Unknown name or option, one without effect, or an environment that is not ours.
     """
     if name not in policy_names():
         raise unknown_name("policy", name, policy_names())
@@ -142,11 +143,24 @@ def make(name: str, env: Any, **options: Any) -> Policy:
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
             'gymnasium.make("elastic_env/Testbed-v0") and pass it here, also if the policy is to run on a wrapper of it'
         )
-    model, chosen = _assumed(env, PolicyOptions(**options)), PolicyOptions(**options)
-    known = _ON_THE_WALKER if isinstance(model, WalkerModel) else _ON_THE_TESTBED
+    given = {option: value for option, value in options.items() if value is not None}
+    chosen = PolicyOptions(**given)
+    known = _ON_THE_WALKER if isinstance(env.unwrapped.assumed_model, WalkerModel) else _ON_THE_TESTBED
     if name not in known:
         raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, known)
-    return known[name](env, model, chosen)
+    build, usable = known[name]
+    _require_effect(name, env, given, usable)
+    return build(env, _assumed(env, chosen), chosen)
+
+
+def _require_effect(name: str, env: Any, given: Iterable[str], usable: Sequence[str]) -> None:
+    for option in given:
+        if option not in usable:
+            takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
+            # of those with options the oracle alone assumes no stiffness
+            why = " but knows the true one" if option in _ASSUMED and usable else ""
+            task = env.unwrapped.task.name
+            raise ConfigurationError(f"the policy {name!r} of the {task} does not use {option}{why}; {takes}")
 
 
 def _assumed(env: Any, options: PolicyOptions) -> RobotModel:

@@ -5,12 +5,15 @@ value raises an error that names the field, the unit, the bound and what was giv
 lists the keys that exist.
 """
 
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
 
+import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from elastic_env.errors import ConfigurationError, unknown_name
 
@@ -30,7 +33,10 @@ def quantity(unit: str, default: Any = ..., *, description: str, **bounds: Any) 
 
 
 class Model(BaseModel):
-    """Base of all parameter models: frozen, no unknown keys, no NaN, errors with unit and bound."""
+    """Base of all parameter models: frozen, no unknown keys, no NaN, errors with unit and bound.
+
+    Numbers are numbers: Python's or NumPy's, and arrays of them, but neither text nor truth values.
+    """
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, use_attribute_docstrings=True
@@ -42,9 +48,75 @@ class Model(BaseModel):
         except ValidationError as error:
             raise ConfigurationError(_explain(type(self), error)) from None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _numbers_are_numbers(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        fields = cls.model_fields
+        return {
+            name: _only_numbers(plain_numbers(value))
+            if name in fields and _is_numeric(fields[name].annotation)
+            else value
+            for name, value in values.items()
+        }
+
     def replace(self, **changes: Any) -> Self:
         """A validated copy with some parameters changed."""
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+
+
+def plain_numbers(value: Any) -> Any:
+    """NumPy's numbers and arrays as Python's numbers and lists, also within lists, tuples and mappings.
+
+    A number of less than double precision becomes what it is written as: 1.6 and not 1.600000023841858.
+    """
+    match value:
+        case np.ndarray():
+            return plain_numbers(list(value) if value.ndim else value[()])
+        case np.floating() if not isinstance(value, float):
+            return float(str(value))
+        case np.generic():
+            return value.item()
+        case list():
+            return [plain_numbers(item) for item in value]
+        case tuple():
+            return tuple(plain_numbers(item) for item in value)
+        case dict():
+            return {key: plain_numbers(item) for key, item in value.items()}
+        case _:
+            return value
+
+
+@dataclass(frozen=True)
+class _NoNumber:
+    """Text or a truth value in a number's place, which Pydantic would convert; shown as it was given."""
+
+    given: Any
+
+    def __repr__(self) -> str:
+        return repr(self.given)
+
+
+def _only_numbers(value: Any) -> Any:
+    """The same with text and truth values, also within lists, tuples and mappings, made what no number field takes."""
+    if isinstance(value, list | tuple):
+        return [_only_numbers(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _only_numbers(item) for key, item in value.items()}
+    return _NoNumber(value) if isinstance(value, str | bytes | bool) else value
+
+
+def _is_numeric(annotation: Any) -> bool:
+    """Whether an annotation is of numbers, or of lists, tuples and mappings of them, and allows nothing else."""
+    if annotation in (int, float):
+        return True
+    arguments = [part for part in get_args(annotation) if part not in (type(None), Ellipsis)]
+    if get_origin(annotation) is Annotated:
+        arguments = arguments[:1]
+    if get_origin(annotation) is dict:
+        arguments = arguments[1:]
+    return bool(arguments) and all(map(_is_numeric, arguments))
 
 
 def _explain(model: type[BaseModel], error: ValidationError) -> str:
@@ -88,6 +160,23 @@ def _unit(model: type[BaseModel], name: str) -> str:
     return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""
 
 
+class _Loader(yaml.SafeLoader):
+    """PyYAML's, with the numbers of YAML 1.2 and JSON: 1e3 is one too, which YAML 1.1 takes for text."""
+
+
+_EXPONENT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
+
+
+def parse_yaml(text: str) -> Any:
+    """What a text in YAML holds.
+
+    Raises:
+        yaml.YAMLError: It is not YAML.
+    """
+    return yaml.load(text, _Loader)
+
+
 def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     """Read a YAML file into a validated model.
 
@@ -100,7 +189,7 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
         listing = f"; found beside it: {', '.join(known)}" if known else ""
         raise ConfigurationError(f"no configuration file at {file}{listing}")
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content = parse_yaml(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
     if not isinstance(content, dict):

@@ -1,11 +1,12 @@
 """Parameter models and YAML files: what is wrong must be named, with what would be right."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from elastic_env.config import Model, load_yaml, quantity
+from elastic_env.config import Model, load_yaml, parse_yaml, quantity
 from elastic_env.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
 from elastic_env.tasks.testbed_config import TestbedConfig
 
@@ -56,6 +57,67 @@ def test_a_wrong_value_names_parameter_unit_bound_and_itself(values: dict[str, o
     """Catches an error message without one of the four, also where models are nested."""
     with pytest.raises(ConfigurationError, match=message):
         Outer(**values)
+
+
+class Numbers(Model):
+    """A model with numbers in every arrangement, and with fields that are no numbers alone."""
+
+    one: float | None = None
+    count: int = 1
+    several: list[float] = []
+    fixed: tuple[float, ...] = ()
+    named: dict[str, int] = {}
+    switch: bool = False
+    anything: Any = None
+    path_or_number: str | float = 0.0
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"one": "1"},
+        {"one": True},
+        {"one": np.True_},
+        {"one": b"1"},
+        {"count": "2"},
+        {"count": True},
+        {"several": [1.0, "2"]},
+        {"several": np.array([True, True])},
+        {"fixed": (True, 1.0)},
+        {"fixed": np.array(["1", "2"])},
+        {"named": {"a": "1"}},
+        {"named": {"a": False}},
+    ],
+)
+def test_text_and_truth_are_no_numbers(values: dict[str, object]) -> None:
+    """Catches "2" taken for 2, and True for 1, also where numbers stand in lists and mappings."""
+    (name,) = values
+    with pytest.raises(
+        ConfigurationError, match=rf"^Numbers\.{name}[.\w]* must be a valid (number|integer), got (b?['\"]|True|False)"
+    ):
+        Numbers(**values)
+
+
+def test_numbers_may_be_those_of_numpy() -> None:
+    """Catches arrays that are refused, and a float32 that becomes a neighbour of what is written."""
+    model = Numbers(
+        one=np.float32(1.6), count=np.int64(3), several=np.array([0.8, 0.6], dtype=np.float32), fixed=np.arange(2),
+        named={"a": np.uint8(4)}, path_or_number="1", anything="2",
+    )  # fmt: skip
+    assert (model.one, model.count, model.several, model.fixed) == (1.6, 3, [0.8, 0.6], (0.0, 1.0))
+    assert (model.named, model.path_or_number, model.anything) == ({"a": 4}, "1", "2")
+    assert type(model.one) is float
+    assert Numbers(one=np.array(2.5)).one == 2.5
+    with pytest.raises(ConfigurationError, match=r"Numbers\.one must be a finite number, got nan"):
+        Numbers(one=np.float32("nan"))
+
+
+@pytest.mark.parametrize("text", ["1e3", "1E3", "+1e+3", "1.0e3", "10.e2", ".1e4", "1000", "1e3 # a remark"])
+def test_numbers_with_an_exponent_are_numbers(text: str) -> None:
+    """Catches the YAML of 2005, in which 1e3 is text."""
+    assert parse_yaml(text) == 1000
+    assert parse_yaml("1e3.json") == "1e3.json"
+    assert parse_yaml("'1e3'") == "1e3"
 
 
 def test_every_problem_is_reported_at_once() -> None:

@@ -1,6 +1,7 @@
 """Gait: phases against a walk counted out step by step, the ZMP's path against its boundary conditions."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,11 +115,15 @@ def test_a_duration_between_control_steps_is_an_error(name: str) -> None:
         r"the nearest are 0\.5 s and 0\.504 s$",
     ):
         timed(gait)
-    with pytest.raises(ConfigurationError, match=rf"^{name} must be a multiple .* got 0\.001 s; .* 0\.004 s"):
+    with pytest.raises(
+        ConfigurationError, match=rf"^{name} must be a multiple .* got 0\.001 s; the nearest is 0\.004 s$"
+    ):
         timed(gait.replace(**{name: 0.001}))
+    with pytest.raises(ConfigurationError, match=r"the nearest are 2000 s and 2000\.004 s$"):
+        timed(gait.replace(**{name: 2000.001}))
 
 
-@pytest.mark.parametrize("given", [2, 2.0, "fast", None, float("nan"), (), (0.5, 0.6), [0.5, 0.6, 0.5, 0.6], True])
+@pytest.mark.parametrize("given", [2, 2.0, "fast", None, float("nan"), (), (0.5, 0.6), [0.5, 0.6, 0.5, 0.6], True, "3"])
 def test_a_gait_without_a_name_is_an_error_that_lists_the_names(given: object) -> None:
     """Catches the nearest gait taken for the one that was meant, and a tuple of another length."""
     with pytest.raises(ConfigurationError) as caught:
@@ -128,11 +133,25 @@ def test_a_gait_without_a_name_is_an_error_that_lists_the_names(given: object) -
 
 
 @pytest.mark.parametrize(
+    "given", [np.float32(1.6), np.float64(1.6), np.array(1.6), np.array([0.5, 0.6, 0.5]), np.float32([0.5, 0.6, 0.5])]
+)
+def test_durations_may_be_numbers_of_numpy(given: Any) -> None:
+    """Catches a gait that an array cannot name, and a period that single precision moves off its name."""
+    gait = make_gait(given, num_steps=np.int64(2))
+    assert gait == make_gait(1.6, num_steps=2)
+    assert len(timed(gait).time) == len(timed(make_gait(1.6, num_steps=2)).time)
+
+
+@pytest.mark.parametrize(
     ("parameters", "message"),
     [
         ({"step_period": (0.5, -0.1, 0.5)}, r"Gait.single_support_s must be a finite number > 0 \[s\], got -0.1"),
         ({"step_period": 3, "num_steps": 0}, "Gait.num_steps must be a whole number >= 1, got 0"),
         ({"step_period": 3, "lift_m": 0.0}, r"Gait.lift_m must be a finite number > 0 \[m\], got 0.0"),
+        ({"step_period": ["0.5", "0.6", "0.5"]}, r"Gait.double_support_s must be a finite number > 0 \[s\], got '0.5'"),
+        ({"step_period": [True] * 3}, r"Gait.double_support_s must be a finite number > 0 \[s\], got True"),
+        ({"step_period": 3, "num_steps": "2"}, "Gait.num_steps must be a whole number >= 1, got '2'"),
+        ({"step_period": 3, "num_steps": True}, "Gait.num_steps must be a whole number >= 1, got True"),
         ({"step_period": 3, "lift": 0.1}, "unknown parameter of Gait 'lift'.*Did you mean 'lift_m'"),
         (
             {"step_period": (0.3, 0.5, 0.08), "transfer": "ramp"},

@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensators import GravityCompensator
+from baselines.policy import Zero
+from baselines.walking_controller import WalkingGains
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 
@@ -31,6 +33,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 PERIOD_S = 0.004
 AT_ONCE = {"ramp_s": PERIOD_S}
 """Options with which the compensation is there from the first step."""
+
+
+def at_once(name: str) -> dict[str, float]:
+    """The same, for a policy that compensates."""
+    return AT_ONCE if name in WITH_MEMORY else {}
 
 
 def scalar(**arguments: Any) -> Any:
@@ -120,9 +127,9 @@ def test_actions_are_float32_of_the_shape_of_the_observations(name: str) -> None
     env, worlds = scalar(), vector(2)
     single, _ = env.reset(seed=4)
     rows, _ = worlds.reset(seed=4)
-    action, _ = baselines.make(name, env, **AT_ONCE).predict(single)
-    actions, _ = baselines.make(name, worlds, **AT_ONCE).predict(rows)
-    row, _ = baselines.make(name, env, **AT_ONCE).predict(single[None])
+    action, _ = baselines.make(name, env, **at_once(name)).predict(single)
+    actions, _ = baselines.make(name, worlds, **at_once(name)).predict(rows)
+    row, _ = baselines.make(name, env, **at_once(name)).predict(single[None])
     assert (action.dtype, action.shape) == (np.float32, (1,))
     assert (actions.dtype, actions.shape) == (np.float32, (2, 1))
     assert row.shape == (1, 1)
@@ -210,7 +217,7 @@ def test_policies_other_than_the_oracle_get_along_without_the_truth(name: str) -
     task = SimpleNamespace(observation_table=inside.task.observation_table)
     blind = SimpleNamespace(unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task))
     observation, _ = env.reset(seed=0)
-    actions = [baselines.make(name, e, **AT_ONCE).predict(observation)[0] for e in (env, blind)]
+    actions = [baselines.make(name, e, **at_once(name)).predict(observation)[0] for e in (env, blind)]
     np.testing.assert_array_equal(actions[0], actions[1])
 
 
@@ -256,12 +263,15 @@ def test_scenario_changes_the_true_stiffness() -> None:
     assert scalar(scenario="soft").unwrapped.truth().model.stiffness == pytest.approx([700.7])
 
 
-@pytest.mark.parametrize("kind", ["float", "int", "list", "path", "text"])
+@pytest.mark.parametrize("kind", ["float", "int", "list", "path", "text", "numpy", "array"])
 def test_stiffness_can_be_a_number_a_list_or_an_identification(kind: str, tmp_path: Path) -> None:
     """Catches an option that is read but not used, or that only some types reach."""
     path = tmp_path / "identification.json"
     path.write_text(json.dumps({"stiffness_nm_per_rad": 640.0, "points": 12}))
-    given = {"float": 640.0, "int": 640, "list": [640.0], "path": path, "text": str(path)}[kind]
+    given = {
+        "float": 640.0, "int": 640, "list": [640.0], "path": path, "text": str(path), "numpy": np.float32(640.0),
+        "array": np.array([640]),
+    }[kind]  # fmt: skip
     action, q_ref = compensation(scalar(), stiffness=given)
     assert action == np.float32(60.0 * np.sin(q_ref) / 640.0)
 
@@ -270,6 +280,13 @@ def test_stiffness_of_the_environment_is_the_one_that_input_assumes() -> None:
     """Catches `stiffness=` that changes the plant alone."""
     action, q_ref = compensation(scalar(stiffness=300.0))
     assert action == np.float32(60.0 * np.sin(q_ref) / 300.0)
+
+
+@pytest.mark.parametrize("value", [["900"], [True], np.array(["900"]), True, [[900.0], [1.0, 2.0]]])
+def test_stiffness_that_is_no_number_is_an_error(value: object) -> None:
+    """Catches text and truth that NumPy converts."""
+    with pytest.raises(ConfigurationError, match=r"stiffness must be (a )?numbers? \[N·m/rad\]"):
+        baselines.make("input", scalar(), stiffness=value)
 
 
 @pytest.mark.parametrize("value", [-5.0, 0.0, np.nan, np.inf])
@@ -330,8 +347,32 @@ def test_ramp_must_be_positive() -> None:
 
 def test_oracle_takes_no_stiffness() -> None:
     """Catches an option of the oracle that would be ignored."""
-    with pytest.raises(ConfigurationError, match="knows the true stiffness"):
-        baselines.make("oracle", scalar(), stiffness=900.0)
+    with pytest.raises(ConfigurationError, match=r"does not use stiffness but knows the true one; .*: ramp_s$"):
+        baselines.make("oracle", scalar(), stiffness=np.array([900.0]))
+
+
+FAST = WalkingGains(force_difference=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "message"),
+    [
+        ("zero", {"stiffness": 5}, "'zero' of the testbed does not use stiffness; it has no options$"),
+        ("uncompensated", {"ramp_s": 1.0}, "'uncompensated' of the testbed does not use ramp_s; it has no options$"),
+        ("input", {"com_feedback": True}, "com_feedback; .*: stiffness, stiffness_scale, output, gravity, ramp_s$"),
+        ("dynamic", {"gains": FAST}, "gains; its options are: stiffness, stiffness_scale, output, gravity, ramp_s$"),
+        ("oracle", {"output": "newton"}, "output; its options are: ramp_s$"),
+    ],
+)
+def test_an_option_without_effect_is_an_error(name: str, option: dict[str, Any], message: str) -> None:
+    """Catches an option of the walker, or of a compensator that is not there, which changes nothing."""
+    with pytest.raises(ConfigurationError, match=message):
+        baselines.make(name, scalar(), **option)
+
+
+def test_an_option_that_is_none_is_not_given() -> None:
+    """Catches a default that is handed on and refused."""
+    assert isinstance(baselines.make("zero", scalar(), stiffness=None, output=None), Zero)
 
 
 def test_oracle_integrates_the_true_link_error_up_to_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:

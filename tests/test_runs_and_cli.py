@@ -320,6 +320,9 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
     row = next(line for line in table.export_text().splitlines() if "input" in line)
     assert "2.00" in row
     assert "2/4" in row
+    assert train.summary.failure_notes([Evaluation(condition(), episodes)]) == []
+    failed = Evaluation(condition(), [episode for episode in episodes if episode["termination"]])
+    assert train.summary.failure_notes([failed]) == ["input: diverged (2 of 2)"]  # the testbed keeps no time of it
 
 
 @pytest.mark.usefixtures("in_process")
@@ -337,18 +340,20 @@ def test_evaluate_again_makes_a_second_folder_and_leaves_the_first(capsys: pytes
 
 
 @pytest.mark.usefixtures("in_process")
-def test_evaluate_hands_the_stiffness_of_a_file_to_the_policy() -> None:
+def test_evaluate_hands_the_stiffness_to_the_policy() -> None:
     """Catches an option that is read and forgotten: a policy that believes in 2 K compensates half the deflection."""
     Path("identification.json").write_text('{"stiffness_nm_per_rad": 2002.0}')
     reference = "{kind: sine, middle: 0.5, amplitude: 0.005, duration_s: 0.1, onset_s: 0.2}"
     arguments = ["evaluate", "--reference", reference, "--scenario", "ideal"]
-    for more in (["--stiffness", "identification.json"], ["--stiffness", "2002"], [], ["--policy", "uncompensated"]):
+    for stiffness in ("identification.json", "2002", "[2002.0]"):
+        main([*arguments, "--stiffness", stiffness])
+    for more in ([], ["--policy", "uncompensated"]):
         main([*arguments, *more])
-    folders = ["evaluate", "evaluate-2", "evaluate-3", "evaluate-4"]
+    folders = ["evaluate", "evaluate-2", "evaluate-3", "evaluate-4", "evaluate-5"]
     rms = [float(rows_of(Path("runs") / f / "episodes.csv")[0]["link_error_rms_rad"]) for f in folders]
-    assert rms[0] == rms[1]
-    assert rms[0] == pytest.approx(0.5 * rms[3], rel=0.05)
-    assert rms[2] < 0.05 * rms[3]
+    assert rms[0] == rms[1] == rms[2]
+    assert rms[0] == pytest.approx(0.5 * rms[4], rel=0.05)
+    assert rms[3] < 0.05 * rms[4]
 
 
 @pytest.mark.usefixtures("in_process")
@@ -403,10 +408,13 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "policy's environment option": (
         {"name": "c", "policies": [{"name": "zero", "env_options": {"from": "rigid"}}]}, ["'from'", "form", "stiffness"]
     ),
-    "reserved option": ({"name": "c", "env_options": {"step_period": 3}}, ["step_period", "keys of their own"]),
+    "reserved option": ({"name": "c", "env_options": {"step_period": 3}}, ["step_period cannot", "key", "of its own"]),
     "reserved parameter": (
         {"name": "c", "env": "walker", "references": [{"step_period": 3, "scenario": "ideal"}]},
-        ["scenario", "reference"],
+        ["references.0: scenario cannot be part of a reference; it has a key"],
+    ),
+    "unplaced parameter": (
+        {"name": "c", "references": [{"kind": "sine", "num_envs": 3}]}, ["num_envs cannot", "set it themselves"]
     ),
     "no reference": ({"name": "c", "references": [None]}, ["reference", "name", "mapping", "None"]),
     "policy of the figures": ({"name": "c", "figure_policies": ["inptu"]}, ["'inptu'", "uncompensated", "input"]),
@@ -416,6 +424,10 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "sweep key": ({"name": "c", "sweep": {"options": "x", "values": [1, 2]}}, ["'options'", "option"]),
     "swept option": (
         {"name": "c", "sweep": {"option": "stiffnes", "values": [1, 2]}}, ["'stiffnes'", "stiffness_scale"]
+    ),
+    "swept in vain": (
+        {"name": "c", "sweep": {"option": "stiffness_scale", "values": [1, 2]}},
+        ["'uncompensated' of the testbed does not use stiffness_scale", "it has no options", "level: true"],
     ),
     "stiffness": ({"name": "c", "env_options": {"stiffness": -3}}, ["stiffness", "> 0", "[N·m/rad]", "-3"]),
     "no mapping": (["input"], ["mapping", "list"]),
@@ -438,6 +450,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "module": (["evaluate", "--policy", "nowhere:f"], ["nowhere", "input", "module:function"]),
     "function": (["evaluate", "--policy", "math:nothing"], ["nothing", "input", "module:function"]),
     "no policy": (["evaluate", "--policy", f"{__name__}:condition_of"], ["condition_of", "predict()"]),
+    "no function": (["evaluate", "--policy", "math:pi"], ["'math:pi'", "float", "module:function"]),
+    "no module": (["evaluate", "--policy", ":x"], ["':x'", "module:function"]),
+    "no attribute": (["evaluate", "--policy", "math:"], ["'math:'", "module:function"]),
+    "relative module": (["play", "--policy", ".x:f", "--video", "x.gif"], ["'.x:f'", "module:function"]),
     "scenario": (["evaluate", "--scenario", "sof"], ["'sof'", "ideal", "nominal", "soft", "payload", "sensor"]),
     "ground": (["evaluate", "--scenario", "soft+ideal"], ["'ideal'", "first"]),
     "reference": (["evaluate", "--reference", "sin"], ["'sin'", "hold", "sine", "multisine", "steps"]),
@@ -453,24 +469,36 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["'steps'", "num_steps", "gait"],
     ),
     "walk policy": (["evaluate", "--env", "walker", "--policy", "inptu"], ["'inptu'", "input_output", "input_wrench"]),
-    "episodes": (["evaluate", "--episodes", "0"], ["episodes", ">= 1"]),
-    "seed": (["evaluate", "--seed", "-1"], ["seed", ">= 0", "-1"]),
+    "episodes": (["evaluate", "--episodes", "0"], ["error: --episodes must be", ">= 1"]),
+    "seed": (["evaluate", "--seed", "-1"], ["error: --seed must be", ">= 0", "-1"]),
+    "both": (["evaluate", "--seed", "-1", "--episodes", "0"], ["--episodes must be", "\n--seed must be"]),
+    "reserved": (
+        ["evaluate", "--env", "walker", "--reference", "{step_period: 3, scenario: ideal}"],
+        ["error: --reference: scenario cannot be part of a reference; it has a key, or an option, of its own"],
+    ),
     "assumed": (["evaluate", "--stiffness", "-5"], ["stiffness", "> 0", "[N·m/rad]", "-5"]),
+    "assumed list": (
+        ["evaluate", "--stiffness", "[1001, 1001]"],
+        ["stiffness", "one number or 1", "[N·m/rad]", "(2,)"],
+    ),
+    "assumed text": (["evaluate", "--stiffness", "[soft]"], ["stiffness must be numbers", "'soft'"]),
+    "assumed nan": (["evaluate", "--stiffness", "nan"], ["stiffness", "> 0", "nan"]),
     "assumed file": (["evaluate", "--stiffness", "none.json"], ["none.json"]),
     "missing file": (["compare", "none.yaml"], ["none.yaml"]),
     "brackets": (["compare", "[/bold].yaml"], ["[/bold].yaml"]),
     "jobs": (["compare", "good.yaml", "--jobs", "-1"], ["jobs", "-1"]),
     "identify scenario": (["identify", "--scenario", "sof"], ["'sof'", "soft"]),
-    "identify seed": (["identify", "--seed", "-1"], ["seed", "-1"]),
+    "identify seed": (["identify", "--seed", "-1"], ["--seed must be", "-1"]),
     "identify K": (["identify", "--stiffness", "-1"], ["stiffness", "> 0", "[N·m/rad]"]),
     "identify positions": (["identify", "--positions", "4"], ["positions", ">= 5", "4"]),
     "identify masses": (["identify", "--second-mass", "0"], ["mass", "> 0"]),
     "identify equal masses": (["identify", "--second-mass", "1"], ["mass"]),
     "play scenario": (["play", "--scenario", "sof", "--video", "x.gif"], ["'sof'", "soft"]),
+    "play seed": (["play", "--seed", "-1", "--video", "x.gif"], ["error: --seed must be", "-1"]),
     "play environment": (["play", "--env", "wlaker", "--video", "x.gif"], ["'wlaker'", "testbed", "walker"]),
     "play format": (["play", "--video", "x.txt", "--max-s", "0.1"], [".mp4", ".gif", "x.txt"]),
     "play time": (["play", "--video", "x.gif", "--max-s", "-1"], ["max", "-1"]),
-    "speed worlds": (["speed", "--num-envs", "0"], ["num_envs", "0"]),
+    "speed worlds": (["speed", "--num-envs", "0"], ["error: --num-envs must be", "0"]),
     "speed steps": (["speed", "--num-envs", "2", "--steps", "0"], ["steps", "0"]),
     "speed environment": (["speed", "--env", "wlaker"], ["'wlaker'", "testbed", "walker"]),
     "speed policy": (["speed", "--num-envs", "2", "--policy", "inptu"], ["'inptu'", "input", "oracle"]),
@@ -511,6 +539,7 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
         (["--help"], ["identify", "evaluate", "compare", "speed", "play"]),
         (["evaluate", "--help"], ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"]),
         (["evaluate", "--help"], ["walker", "input_wrench", "step_period", "num_steps", "push"]),
+        (["evaluate", "--help"], ["a list of one per joint", "twelve on the walker", "identification.json"]),
         (["play", "--help"], ["walker", "--reference", ".mp4"]),
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
         (["compare", "--help"], ["configs/", "episodes.csv", "--jobs"]),
@@ -600,6 +629,27 @@ def test_play_writes_mp4() -> None:
     assert Path("deep/x.mp4").read_bytes()[4:8] == b"ftyp"
 
 
+@pytest.mark.parametrize(("max_s", "steps"), [(0.001, 1), (0.012, 3), (float("inf"), 375)])
+def test_play_takes_one_step_at_least_and_the_episode_at_most(
+    max_s: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a film without a picture, which is announced and not there, and a time without end that is none."""
+    played = []
+
+    def film(env: Any, episode: Any, total: int, *_: Any) -> None:
+        played.append((total, len(list(episode))))
+
+    monkeypatch.setattr("train.play._film", film)
+    play(condition(), Console(quiet=True), Path("x.gif"), max_s=max_s)
+    assert played == [(steps, steps)]
+
+
+def test_play_films_a_time_shorter_than_a_control_step() -> None:
+    """Catches a film that is announced and not there."""
+    play(condition(), Console(quiet=True), Path("x.mp4"), max_s=0.001)
+    assert Path("x.mp4").stat().st_size > 0
+
+
 @pytest.mark.usefixtures("in_process")
 def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -612,7 +662,7 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch.setattr(train.demo, "_WALK", train.demo._WALK.replace(references=[short_walk]))
     main(["demo"])
     printed = capsys.readouterr().out
-    walks = {"pelvis_0.3+0.5+0.3_s_nominal.png", "zmp_0.3+0.5+0.3_s_nominal.png"}
+    walks = {"pelvis_0.3+0.5+0.3_s_num_steps=1_nominal.png", "zmp_0.3+0.5+0.3_s_num_steps=1_nominal.png"}
     names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json", *walks}
     names |= {"episodes.csv", "summary.md"}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}

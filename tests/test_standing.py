@@ -2,6 +2,7 @@
 
 import copy
 from functools import cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -126,6 +127,20 @@ def test_a_robot_that_cannot_stand_is_an_error(stiffness: float) -> None:
         match=r"does not stand: pelvis at -?0\.\d+ m \(planned 0\.660 m\).*is a joint too soft for the load\?$",
     ):
         settled(soft)
+
+
+def test_joints_too_stiff_for_the_physics_step_are_an_error_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches advice to stiffen a joint whose stiffness is what makes the simulation diverge."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings there
+    stiff = {name: j.replace(stiffness=1e6 if name == "l_knee" else 9e5) for name, j in ROBOT.joints.items()}
+    with pytest.raises(
+        ElasticError, match=r"largest K of 1e\+06 N·m/rad.*too stiff.*timestep_s = 0\.001 s; lower"
+    ) as error:
+        settled(stiff)
+    assert "nan" not in str(error.value)
+    assert "soft" not in str(error.value)
 
 
 def test_the_plant_itself_is_not_changed() -> None:

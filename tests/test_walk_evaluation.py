@@ -27,7 +27,7 @@ from train.compare import CompareConfig, try_out
 from train.conditions import Condition, PolicySpec
 from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
-from train.summary import print_summary, summary_table, write_summary
+from train.summary import failure_notes, print_summary, summary_table, write_summary
 from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.sweep_plots import draw_sweep
 from train.walk_plots import draw_pelvis, draw_zmp, intervals
@@ -171,7 +171,13 @@ def test_record_of_a_walk_names_its_cell_and_agrees_with_its_trace() -> None:
     cell = walk("input_output", episodes=2, seed=3)
     result = evaluate(cell, num_threads=1)
     record, trace = result.episodes[0], result.trace
-    named = {"reference": "0.3+0.5+0.3 s", "step_period_s": 1.1, "scenario": "nominal", "seed": 3, "termination": ""}
+    named = {
+        "reference": "0.3+0.5+0.3 s num_steps=1",
+        "step_period_s": 1.1,
+        "scenario": "nominal",
+        "seed": 3,
+        "termination": "",
+    }
     assert {key: record[key] for key in named} == named
     scored = (trace["time_s"] > 1.0 + 1e-9) & (trace["time_s"] < 2.1 + 1e-9)
     assert record["pelvis_roll_rms_rad"] == pytest.approx(np.sqrt(np.mean(trace["pelvis_roll"][scored] ** 2)), rel=1e-9)
@@ -218,11 +224,39 @@ def test_a_fall_is_counted_and_not_scored(fallen: Evaluation) -> None:
 # Tables.
 
 
+def test_a_fall_of_all_says_when(fallen: Evaluation, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a policy of which nothing is known but that it fell, a mean of the times, and one of some that fell."""
+    several, some = (made_up(walk(p, episodes=3), *[(end, 0.1) for end in ends]) for p, ends in FALLS.items())
+    for cell in (several, some):
+        for episode, time in zip(cell.episodes, (3.42, 3.31, 9.0), strict=True):
+            episode["duration_s"] = time
+    time = fallen.trace["time_s"][-1]
+    notes = ["zero: fell after 3.4 s (3 of 3)"]
+    assert failure_notes([several, some]) == notes
+    assert failure_notes([fallen]) == [f"zero: fell after {time:.1f} s (1 of 1)"]
+    other = made_up(walk("zero", scenario="soft"), ("fell", 0.1))
+    other.episodes[0]["duration_s"] = 2.0
+    name = several.condition.reference_name
+    assert failure_notes([several, other]) == [
+        f"{name}, nominal, {notes[0]}",
+        f"{name}, soft, zero: fell after 2.0 s (1 of 1)",
+    ]
+    print_summary([several, some], Console(width=100))
+    assert notes[0] in capsys.readouterr().out.splitlines()
+    assert f"* {notes[0]}" in write_summary([several, some], Path("summary.md")).read_text().splitlines()
+    assert "failed:" not in write_summary([some], Path("summary.md")).read_text()
+
+
+FALLS = {"zero": ("fell", "fell", "fell"), "input": ("fell", "", "fell")}
+
+
 def test_tables_say_median_worst_and_falls() -> None:
     """Catches a fall averaged in, a worst episode that fell, and phases that are left out."""
     cell = made_up(walk("input", episodes=4), ("", 0.002), ("fell", 9.0), ("", 0.004), ("", 0.003))
     text = write_summary([cell], Path("summary.md")).read_text()
-    first, second = (line for line in text.splitlines() if line.startswith("| 0.3+0.5+0.3 s | nominal | input |"))
+    first, second = (
+        line for line in text.splitlines() if line.startswith("| 0.3+0.5+0.3 s num_steps=1 | nominal | input |")
+    )
     assert first.count("3.00 (4.00)") == 4  # roll and pitch
     assert second.count("(4.00)") == 9  # roll, pitch and ZMP in three phases
     assert first.endswith("| 1/4 |")
@@ -281,12 +315,23 @@ def test_intervals_are_where_a_mask_is_true() -> None:
         ("zmp", 24, "nominal", "fig9_zmp_24_s_nominal"),
         ("zmp", 3.0, "nominal", "fig10_zmp_3_s_nominal"),
         ("zmp", 3, "soft", "zmp_3_s_soft"),
+        ("pelvis", {"step_period": 3, "num_steps": 4}, "nominal", "fig8_pelvis_3_s_nominal"),
+        ("pelvis", {"step_period": 3, "num_steps": 1}, "nominal", "pelvis_3_s_num_steps=1_nominal"),
+        ("zmp", {"step_period": 24, "num_steps": 1}, "nominal", "zmp_24_s_num_steps=1_nominal"),
         ("pelvis", [0.8, 0.6, 0.8], "nominal", "pelvis_0.8+0.6+0.8_s_nominal"),
     ],
 )
 def test_figures_have_the_numbers_of_the_paper(kind: str, reference: Any, scenario: str, name: str) -> None:
     """Catches a picture that claims to be the paper's and is not."""
     assert figure_name(kind, Evaluation(walk(reference=reference, scenario=scenario))) == name
+
+
+def test_references_that_differ_stay_apart_and_say_each_parameter_once() -> None:
+    """Catches a number of steps that is named twice, and two gaits of one name."""
+    walks = [{"step_period": 3, "num_steps": 1, "form": form} for form in ("tendon", "rigid")]
+    cells = CompareConfig(name="x", env="walker", references=[*walks, 3], policies=["zero"]).conditions()  # type: ignore[list-item]
+    names = ["3 s num_steps=1 form=tendon", "3 s num_steps=1 form=rigid", "3 s"]
+    assert [cell.reference_name for cell in cells] == names
 
 
 def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
@@ -369,7 +414,7 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     Path("walks.yaml").write_text(yaml.safe_dump(content))
     main(["compare", "walks.yaml"])
     assert drawn == [["input", "rigid"]] * 2
-    stem = "0.3+0.5+0.3_s_ideal.png"
+    stem = "0.3+0.5+0.3_s_num_steps=1_ideal.png"
     files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"}
     folder = Path("runs/walks")
     assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json"}
@@ -383,7 +428,7 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
 def test_evaluate_walks(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a command that knows the testbed alone."""
     main(["evaluate", "--env", "walker", "--reference", COMMAND_SHORT, "--policy", "input_wrench"])
-    assert Path("runs/evaluate/pelvis_0.3+0.5+0.3_s_nominal.png").exists()
+    assert Path("runs/evaluate/pelvis_0.3+0.5+0.3_s_num_steps=1_nominal.png").exists()
     assert "input_wrench" in capsys.readouterr().out
 
 

@@ -356,6 +356,32 @@ def test_a_foot_out_of_reach_is_an_error_that_says_when(hip_height: float, messa
         plan_walk(make_gait(3, num_steps=4, hip_height_m=hip_height), ROBOT, PERIOD_S)
 
 
+@pytest.mark.parametrize(
+    ("gait", "hip_half_spacing", "advice"),
+    [
+        ({"hip_height_m": 0.75}, 0.105, "hip_height_m"),
+        ({"hip_height_m": 0.69}, 0.105, "hip_height_m or hip_half_spacing"),
+        ({"lift_m": 5.0}, 0.105, "lift_m"),
+        ({}, 5.0, "hip_half_spacing"),
+    ],
+)
+def test_advice_for_a_foot_out_of_reach_names_what_helps(
+    gait: dict[str, float], hip_half_spacing: float, advice: str
+) -> None:
+    """Catches advice to lower the hips of a robot whose foot is lifted above them, or whose hips are far apart."""
+    robot = biped(Thormang(hip_half_spacing=hip_half_spacing))
+    with pytest.raises(ConfigurationError, match=f"; lower {advice}$"):
+        plan_walk(make_gait(3, num_steps=4, **gait), robot, PERIOD_S)
+
+
+def test_a_foot_just_out_of_reach_is_seen_to_be() -> None:
+    """Catches a distance that reads as the reach itself: "0.6000 m, at most 0.6 m"."""
+    with pytest.raises(ConfigurationError, match="out of reach") as error:
+        plan_walk(make_gait(3, num_steps=1, hip_height_m=0.7), ROBOT, PERIOD_S)
+    distance, reach = re.findall(r"([\d.]+) m\b", str(error.value))
+    assert float(distance) > float(reach) == 0.6
+
+
 def test_a_plan_is_computed_once() -> None:
     """Catches a plan for every environment, and one that is shared although gait, robot or period differ."""
     plan = planned(1.1)

@@ -200,8 +200,34 @@ def test_stiffness_per_joint_reaches_its_joint() -> None:
 @pytest.mark.parametrize("option", [{"stiffness": 900.0}, {"stiffness_scale": 0.7}])
 def test_oracle_takes_no_stiffness(option: dict[str, Any]) -> None:
     """Catches an option of the oracle that would be ignored."""
-    with pytest.raises(ConfigurationError, match="knows the true stiffness"):
+    with pytest.raises(ConfigurationError, match=r"knows the true one; its options are: gains, com_feedback, ramp_s$"):
         baselines.make("oracle", scalar(), **option)
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("zero", {"stiffness": 5}),
+        ("zero", {"gains": FAST}),
+        ("uncompensated_open", {"com_feedback": True}),
+        ("uncompensated", {"output": "taylor"}),
+        ("uncompensated", {"gravity": "com"}),
+        ("input_open", {"com_feedback": False}),
+        ("oracle", {"gravity": "com"}),
+    ],
+)
+def test_an_option_without_effect_is_an_error(name: str, option: dict[str, Any]) -> None:
+    """Catches an option that is read and not used, because the policy's name has settled it or has no such part."""
+    with pytest.raises(ConfigurationError, match=rf"{name!r} of the walk.* does not use {next(iter(option))}; it"):
+        baselines.make(name, scalar(), **option)
+
+
+@pytest.mark.parametrize("name", ["uncompensated_open", "uncompensated", "input_open", "input", "dynamic"])
+def test_a_sweep_of_the_stiffness_reaches_every_policy_that_assumes_one(name: str) -> None:
+    """Catches the controller alone, which turns torques into the ankles' offsets by K, left out of a sweep."""
+    env = scalar()
+    half = replayed(baselines.make(name, env, stiffness_scale=0.5), recording())
+    assert np.abs(half - commanded(name)).max() > 1e-4
 
 
 def test_oracle_knows_the_true_stiffness_and_mass() -> None:

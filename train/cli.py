@@ -1,7 +1,10 @@
 """The command `elastic`: identify, evaluate, compare, speed, play, demo."""
 
 import os
+import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +14,7 @@ import yaml
 from rich.console import Console
 from rich.markup import escape
 
-from elastic_env.config import load_yaml
+from elastic_env.config import load_yaml, parse_yaml
 from elastic_env.errors import ConfigurationError, ElasticError
 
 _CONSOLE = Console()
@@ -45,7 +48,8 @@ class Identify:
         """Identify, write, print."""
         from train.identify import IdentifyConfig, run_identification
 
-        config = IdentifyConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+        with _options_named():
+            config = IdentifyConfig(**{name: value for name, value in vars(self).items() if name != "output"})
         run_identification(config, _CONSOLE, self.output)
 
 
@@ -78,7 +82,8 @@ class Evaluate:
     seed: int = 0
     """Seed of the first episode."""
     stiffness: str | None = None
-    """K that the policy assumes: a number [N·m/rad] or the path of an identification.json."""
+    """K that the policy assumes: a number [N·m/rad], a list of one per joint
+    such as '[1001]', twelve on the walker, or the path of an identification.json."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
 
@@ -87,11 +92,13 @@ class Evaluate:
         from train.compare import CompareConfig, compare
         from train.conditions import PolicySpec
 
-        options = {} if self.stiffness is None else {"stiffness": _number_or_path(self.stiffness)}
-        config = CompareConfig(
-            name="evaluate", env=self.env, references=[_motion(self.env, self.reference)], scenarios=[self.scenario],
-            policies=[PolicySpec(name=self.policy, options=options)], episodes=self.episodes, seed=self.seed,
-        )  # fmt: skip
+        options = {} if self.stiffness is None else {"stiffness": _stiffness(self.stiffness)}
+        with _options_named():
+            config = CompareConfig(
+                name="evaluate", env=self.env, references=[_motion(self.env, self.reference)],
+                scenarios=[self.scenario], policies=[PolicySpec(name=self.policy, options=options)],
+                episodes=self.episodes, seed=self.seed,
+            )  # fmt: skip
         _print_files(compare(config, _CONSOLE, self.output))
 
 
@@ -147,7 +154,8 @@ class Speed:
         """Measure and report."""
         from train.speed import SpeedConfig, measure_all
 
-        config = SpeedConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+        with _options_named():
+            config = SpeedConfig(**{name: value for name, value in vars(self).items() if name != "output"})
         _CONSOLE.print(f"wrote {measure_all(config, _CONSOLE, self.output)}", soft_wrap=True)
 
 
@@ -183,10 +191,11 @@ class Play:
         from train.play import play
 
         reference = "sine" if self.reference is None and self.env == "testbed" else self.reference
-        condition = Condition(
-            env=self.env, policy=PolicySpec(name=self.policy), reference=_motion(self.env, reference),
-            scenario=self.scenario, seed=self.seed,
-        )  # fmt: skip
+        with _options_named():
+            condition = Condition(
+                env=self.env, policy=PolicySpec(name=self.policy), reference=_motion(self.env, reference),
+                scenario=self.scenario, seed=self.seed,
+            )  # fmt: skip
         play(condition, _CONSOLE, self.video, self.max_s)
 
 
@@ -232,6 +241,19 @@ def main(arguments: list[str] | None = None) -> None:
         os._exit(130)  # worker processes must not keep the terminal waiting
 
 
+_PARAMETER = re.compile(r"^(?:(?:\w+Config|Condition)\.(\w+)|(reference)s?)(?:\.\d+)?(?=:| must be )", re.MULTILINE)
+
+
+@contextmanager
+def _options_named() -> Iterator[None]:
+    """Errors of a configuration that is made from options name the options in place of its parameters."""
+    try:
+        yield
+    except ConfigurationError as error:
+        named = _PARAMETER.sub(lambda found: "--" + (found[1] or found[2]).replace("_", "-"), str(error))
+        raise ConfigurationError(named) from None
+
+
 def _motion(env: str, text: str | None) -> Any:
     """A reference as it is written: a name, a number, durations or a mapping; the environment's default for None."""
     from train.environments import environment
@@ -240,7 +262,7 @@ def _motion(env: str, text: str | None) -> Any:
     if text is None:
         return default
     try:
-        value = yaml.safe_load(text)
+        value = parse_yaml(text)
     except yaml.YAMLError:
         raise ConfigurationError(
             f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "
@@ -249,11 +271,13 @@ def _motion(env: str, text: str | None) -> Any:
     return value if isinstance(value, int | float | list | dict) else text
 
 
-def _number_or_path(text: str) -> float | str:
+def _stiffness(text: str) -> float | list[Any] | str:
+    """A stiffness as it is written: a number, a list of numbers, or else the path of a file."""
     try:
-        return float(text)
-    except ValueError:
+        value = parse_yaml(text)
+    except yaml.YAMLError:
         return text
+    return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
 
 
 def _print_files(comparison: Any) -> None:

@@ -105,7 +105,7 @@ class CompareConfig(Model):
         known = environment(self.env)
         kinds = [known.label(reference) for reference in self.references]
         return [
-            " ".join([kind, *_parameters(reference, known)]) if kinds.count(kind) > 1 else None
+            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)])) if kinds.count(kind) > 1 else None
             for kind, reference in zip(kinds, self.references, strict=True)
         ]
 
@@ -151,7 +151,12 @@ def try_out(conditions: Sequence[Condition]) -> None:
     """Make environments and policies once, so that a wrong name fails before anything runs."""
     for condition in conditions:
         env = make_vector_env(condition, 1)
-        policy = make_policy(condition.policy, env, condition.policy_options)
+        try:
+            policy = make_policy(condition.policy, env, condition.policy_options)
+        except ConfigurationError as error:
+            if not condition.swept:
+                raise
+            raise ConfigurationError(f"{error}; level: true leaves a policy out of the sweep") from None
         if not hasattr(policy, "predict"):
             raise ConfigurationError(
                 f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"

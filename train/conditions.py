@@ -5,14 +5,12 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, field_validator
 
 from elastic_env.config import Model, quantity
-from train.environments import ENVIRONMENTS, RESERVED, Environment, Reference, environment
+from train.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
     motions = {known.motion for known in ENVIRONMENTS.values()}
-    taken = sorted(value.keys() & {*RESERVED, *motions})
-    if taken:
-        raise ValueError(f"{', '.join(taken)} cannot be given here but have keys of their own, or no place")
+    _refuse(value.keys() & {*RESERVED, *motions}, "given here")
     return value
 
 
@@ -21,10 +19,16 @@ def _reference(value: Any) -> Reference:
         raise ValueError(
             f"a reference is a name, a step period [s], three durations [s] or a mapping of parameters, got {value!r}"
         )
-    taken = sorted(value.keys() & set(RESERVED)) if isinstance(value, dict) else []
-    if taken:
-        raise ValueError(f"{', '.join(taken)} cannot be part of a reference but have keys of their own, or no place")
+    if isinstance(value, dict):
+        _refuse(value.keys() & set(RESERVED), "part of a reference")
     return list(value) if isinstance(value, tuple) else value
+
+
+def _refuse(taken: set[str], what: str) -> None:
+    """Refuse arguments of the environments that stand in the wrong place."""
+    for name in sorted(taken):
+        place = "the commands set it themselves" if name in UNPLACED else "it has a key, or an option, of its own"
+        raise ValueError(f"{name} cannot be {what}; {place}")
 
 
 Motion = Annotated[Any, AfterValidator(_reference)]

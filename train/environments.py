@@ -5,12 +5,15 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.walking.gait import Gait
 
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
 
-RESERVED = ("scenario", "num_envs", "num_threads", "autoreset_mode", "render_mode")
-"""Arguments of the environments that have keys of their own, or no place in a comparison."""
+UNPLACED = ("num_envs", "num_threads", "autoreset_mode", "render_mode")
+"""Arguments of the environments that have no place in a comparison."""
+RESERVED = ("scenario", *UNPLACED)
+"""These, and the argument that has a key of its own."""
 
 _UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
 
@@ -96,6 +99,10 @@ class Environment:
         return f"{self.quantity} {reference_name}".strip()
 
 
+_STEPS_OF_THE_PAPER = {"24 s": 2}
+"""Number of steps of the gaits of configs/paper.yaml that have another one than the default."""
+
+
 def environment(name: str) -> Environment:
     """The environment of a short name.
 
@@ -128,9 +135,13 @@ def _walk_arguments(reference: Reference) -> dict[str, Any]:
 
 
 def _walk_label(reference: Reference) -> str:
+    """Step period or durations, and the number of steps where it is not the one that goes without saying."""
     period = _step_period(reference)
     parts = period if isinstance(period, list | tuple) else [period]
-    return "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts) + " s"
+    label = "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts) + " s"
+    steps = reference.get("num_steps") if isinstance(reference, dict) else None
+    usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
+    return label if steps in usual else f"{label} num_steps={steps}"
 
 
 def _walk_abscissa(reference: Reference) -> dict[str, float]:

@@ -41,9 +41,9 @@ class Evaluation:
     points: StaticPoints | None = None
     rest_references: Array = field(default_factory=lambda: np.zeros(0))
 
-    def values(self, metric: str) -> Array:
-        """A metric over the episodes that did not fail, (n,); empty where none of them has it."""
-        found = [episode.get(metric) for episode in self.episodes if not episode["termination"]]
+    def values(self, metric: str, failed: bool = False) -> Array:
+        """A metric over the episodes that did not fail, or over those that did, (n,); empty where none has it."""
+        found = [episode.get(metric) for episode in self.episodes if bool(episode["termination"]) == failed]
         return np.array([value for value in found if value is not None], dtype=np.float64)
 
     @property
@@ -72,14 +72,22 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
     if ":" not in spec.name:
         return baselines.make(spec.name, env, **options)
     module, _, attribute = spec.name.partition(":")
+    if not module or module.startswith("."):
+        raise _not_a_policy(spec, "the module must have its full name")
     try:
         function = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ConfigurationError(
-            f"policy {spec.name!r}: {error}; give a baseline ({', '.join(baselines.policy_names())}) or "
-            '"module:function", a function that takes the environment and returns an object with predict()'
-        ) from None
+        raise _not_a_policy(spec, str(error)) from None
+    if not callable(function):
+        raise _not_a_policy(spec, f"{attribute} is no function but of type {type(function).__name__}")
     return function(env, **options)
+
+
+def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"policy {spec.name!r}: {problem}; give a baseline ({', '.join(baselines.policy_names())}) or "
+        '"module:function", a function that takes the environment and returns an object with predict()'
+    )
 
 
 def make_vector_env(condition: Condition, num_envs: int, num_threads: int = 0) -> Any:

@@ -24,7 +24,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         condition: What to play.
         console: Where messages go.
         video: File to write (mp4 or gif); None opens a window.
-        max_s: Stop after this much simulated time [s].
+        max_s: Stop after this much simulated time [s], one control step at least.
 
     Raises:
         ResultsExistError: The video file exists.
@@ -37,7 +37,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     )  # fmt: skip
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
-    steps = task.num_steps if max_s is None else min(task.num_steps, round(max_s / period))
+    steps = task.num_steps if max_s is None else max(round(min(max_s / period, task.num_steps)), 1)
     episode = _episode(env, make_policy(condition.policy, env), condition.seed, steps, console)
     try:
         if video is None:

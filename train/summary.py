@@ -29,6 +29,8 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
     if shown < len(columns):
         titles = ", ".join(column.title for column in columns[shown:])
         console.print(escape(f"no room for {titles}; summary.md has them"), style="dim")
+    for note in failure_notes(evaluations):
+        console.print(escape(note))
 
 
 def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column] | None = None) -> Table:
@@ -83,6 +85,23 @@ def failures(evaluation: Evaluation) -> str:
     return f"{evaluation.num_failed}/{len(evaluation.episodes)}"
 
 
+def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
+    """How and, on the walker, when the episodes of a cell ended, median [s], for the cells in which all failed."""
+    cells = {(e.condition.reference_name, e.condition.scenario) for e in evaluations}
+    notes = []
+    for e in evaluations:
+        number = len(e.episodes)
+        if e.num_failed == number > 0:
+            reasons = "/".join(dict.fromkeys(episode["termination"] for episode in e.episodes))
+            times = e.values("duration_s", failed=True)
+            when = f" after {np.median(times):.1f} s" if len(times) else ""
+            swept = [f"{name}={value:g}" for name, value in e.condition.swept.items()]
+            cell = [] if len(cells) == 1 else [e.condition.reference_name, e.condition.scenario]
+            who = ", ".join([*cell, " ".join([e.condition.policy.title, *swept])])
+            notes.append(f"{who}: {reasons}{when} ({number} of {number})")
+    return notes
+
+
 def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """One row per episode; columns are names with units."""
     records = [episode for evaluation in evaluations for episode in evaluation.episodes]
@@ -103,6 +122,9 @@ def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
     parts = [head, known.note, _markdown(evaluations, known.columns)]
     for title, columns in known.splits:
         parts += [f"{title}:", _markdown(evaluations, columns)]
+    notes = failure_notes(evaluations)
+    if notes:
+        parts += ["Where all episodes failed:", "\n".join(f"* {note}" for note in notes)]
     path.write_text("\n\n".join(parts) + "\n")
     return path
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from elastic_env.config import plain_numbers
 from elastic_env.elasticity import ElasticJoint, Servo
 from elastic_env.errors import ConfigurationError
 from elastic_env.signals import NO_SIGNALS, Array, SignalTable
@@ -126,11 +127,14 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
     Raises:
         ConfigurationError: The file does not exist or holds no identified stiffness.
     """
-    if isinstance(value, list | tuple | np.ndarray):
+    given, value = value, plain_numbers(value)
+    if isinstance(value, list | tuple):
         try:
+            if any(isinstance(item, str | bool) for item in value):  # NumPy would convert them
+                raise TypeError
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {value!r}") from None
+            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {given!r}") from None
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
         raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {value!r}")
     try:

@@ -41,7 +41,7 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
         command: Servo inputs, (n,) [rad].
 
     Raises:
-        ElasticError: It does not come to rest, or falls.
+        ElasticError: It does not come to rest, or falls, or its joints are too stiff for the physics step.
     """
     calm = copy.copy(model)
     calm.tendon_damping[:] = np.maximum(calm.tendon_damping, _DAMPING)
@@ -55,7 +55,9 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
     for _ in range(round(_LONGEST_S / _CHECK_EVERY_S)):
         mujoco.mj_step(calm, data, substeps)
         rate = float(np.abs(data.qvel).max())
-        if not np.isfinite(rate) or data.qpos[2] < 0.5 * pelvis[2]:
+        if not np.isfinite(rate):
+            raise _diverged(model, data)
+        if data.qpos[2] < 0.5 * pelvis[2]:
             break
         was_calm, is_calm = rate < _REST_RATE, was_calm and rate < _REST_RATE
         if is_calm:  # twice in a row: once may be the turning point of a swing
@@ -63,4 +65,14 @@ def settle(model: mujoco.MjModel, joints: Sequence[str], pelvis: Array, q: Array
     raise ElasticError(
         f"the robot does not stand: pelvis at {data.qpos[2]:.3f} m (planned {pelvis[2]:.3f} m) and moving with "
         f"{np.abs(data.qvel).max():.2g} rad/s or m/s after {data.time:.1f} s; is a joint too soft for the load?"
+    )
+
+
+def _diverged(model: mujoco.MjModel, data: mujoco.MjData) -> ElasticError:
+    """The error for a state that is not finite: joints that the physics step cannot resolve."""
+    stiffest = model.tendon_stiffness.max(initial=0.0)  # the elastic joints' springs are all tendons that there are
+    return ElasticError(
+        f"the simulation of the standing robot diverges within {data.time:.2f} s: with a largest K of {stiffest:g} "
+        "N·m/rad its joints are too stiff, or their links or rotors too light, for timestep_s = "
+        f"{model.opt.timestep:g} s; lower the stiffness or take a shorter timestep_s"
     )

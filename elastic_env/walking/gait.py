@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from elastic_env.config import Model, quantity
+from elastic_env.config import Model, plain_numbers, quantity
 from elastic_env.errors import ConfigurationError
 from elastic_env.plan import STAND_S, control_times, quintic
 from elastic_env.signals import Array, BoolArray, IntArray
@@ -73,13 +73,11 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
     """
     if isinstance(step_period, Gait):
         return step_period.replace(**parameters) if parameters else step_period
-    if isinstance(step_period, tuple | list):
-        durations = tuple(step_period)
-    else:
-        try:
-            durations = STEP_DURATIONS.get(float(step_period), ())
-        except (TypeError, ValueError):
-            durations = ()
+    period, durations = plain_numbers(step_period), ()
+    if isinstance(period, tuple | list):
+        durations = tuple(period)
+    elif isinstance(period, int | float):
+        durations = STEP_DURATIONS.get(period, ())
     if len(durations) != 3:
         known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
         raise ConfigurationError(
@@ -196,9 +194,9 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
     steps = duration_s / control_period_s
     if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-        below, above = (max(bound, 1) * control_period_s for bound in (int(np.floor(steps)), int(np.ceil(steps))))
+        nearest = sorted({max(int(bound), 1) * control_period_s for bound in (np.floor(steps), np.ceil(steps))})
         raise ConfigurationError(
             f"{name} must be a multiple of the control period of {control_period_s} s, got {duration_s} s; "
-            f"the nearest are {below:g} s and {above:g} s"
+            f"the nearest {'is' if len(nearest) == 1 else 'are'} {' and '.join(f'{bound:.10g} s' for bound in nearest)}"
         )
     return round(steps)

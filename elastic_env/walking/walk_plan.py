@@ -170,11 +170,19 @@ def _angles(biped: Biped, pelvis: Array, ankles: Array, time: Array) -> Array:
     try:
         return biped.joint_angles(pelvis, ankles)
     except ElasticError:
-        distance = np.linalg.norm(ankles - pelvis[:, None] - biped.hips, axis=-1)
+        from_hip, reach = ankles - pelvis[:, None] - biped.hips, biped.leg.reach
+        distance = np.linalg.norm(from_hip, axis=-1)
         row, leg = np.unravel_index(int(np.argmax(distance)), distance.shape)
+        x, y, z = from_hip[row, leg]
+        vertical = "lift_m" if z > 0.0 else "hip_height_m"
+        # what would bring the foot into reach if its part of the distance were gone
+        helps = [n for n, left in ((vertical, np.hypot(x, y)), ("hip_half_spacing", np.hypot(x, z))) if left < reach]
+        excess = max(float(distance[row, leg]) - reach, np.finfo(np.float64).eps)
+        decimals = max(4, -int(np.floor(np.log10(excess))))
         raise ConfigurationError(
-            f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s: {distance[row, leg]:.4f} "
-            f"m from the hip to the ankle, at most {biped.leg.reach:g} m; lower hip_height_m, or shift the ZMP less"
+            f"the {('left', 'right')[leg]} foot is out of reach at {time[row]:.3f} s: "
+            f"{distance[row, leg]:.{decimals}f} m from the hip to the ankle, at most {reach:g} m; lower "
+            f"{' or '.join(helps or [vertical])}"
         ) from None
 
 
