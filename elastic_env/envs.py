@@ -1,6 +1,6 @@
 """Gymnasium faces of the worlds: one world as an `Env`, many as a `VectorEnv`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import gymnasium
@@ -67,7 +67,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         self.render_mode = render_mode
         self.observation_space = task.observation_table.space(np.float64)
         self.action_space = task.action_table.space(np.float32)
-        self._worlds = Worlds(task, num_threads=1)
+        self._worlds = Worlds(task, num_threads=1, is_scalar=True)
         self._make_picture = picture
         self._picture: Picture | None = None
         self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
@@ -149,7 +149,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         """Begin an episode in every world, or in those of options["reset_mask"]."""
         mask = np.ones(self.num_envs, dtype=np.bool_)
         if options is not None and "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"], dtype=np.bool_)
+            mask = _checked_mask(options["reset_mask"], self.num_envs)
         seeds = _seeds(seed, self.num_envs)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
@@ -207,14 +207,25 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         return self._worlds.task.observe(), info
 
 
-def _seeds(seed: int | list[int | None] | None, num_envs: int) -> list[int | None]:
+def _seeds(seed: Any, num_envs: int) -> list[int | None]:
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(num_envs)]
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+        raise ConfigurationError(f"seed must be a whole number, one per world ({num_envs}), or None; got {seed!r}")
     if len(seed) != num_envs:
         raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
-    return list(seed)
+    return [None if one is None else int(one) for one in seed]
+
+
+def _checked_mask(mask: Any, num_envs: int) -> BoolArray:
+    given = np.asarray(mask)
+    if given.dtype != np.bool_ or given.shape != (num_envs,):
+        raise ConfigurationError(
+            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got {mask!r}"
+        )
+    return given
 
 
 def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> dict[str, Any]:

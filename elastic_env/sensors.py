@@ -84,7 +84,8 @@ class NoiseStream:
             for world in np.flatnonzero(worlds & (self._used == block)):
                 self._refill(int(world))
             self._most_used = int(self._used.max())
-        sample = self._samples[np.minimum(self._used, block - 1), self._world]
+        at = np.minimum(self._used, block - 1) * len(self._world) + self._world
+        sample = self._samples.reshape(-1, self._samples.shape[2]).take(at, axis=0)
         self._used += worlds
         self._most_used += 1
         return sample

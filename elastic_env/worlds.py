@@ -55,10 +55,12 @@ class Worlds:
     Args:
         task: The rules.
         num_threads: Threads of the physics, 0 for all cores; results do not depend on it.
+        is_scalar: Whether errors speak of one world, whose action has no axis of worlds.
     """
 
-    def __init__(self, task: Task, num_threads: int = 0) -> None:
+    def __init__(self, task: Task, num_threads: int = 0, is_scalar: bool = False) -> None:
         self.task = task
+        self._is_scalar = is_scalar
         self.simulation = simulate(task.model, task.num_worlds, num_threads)
         self._bound = task.action_table.space(np.float32).high.astype(np.float64)
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
@@ -131,18 +133,20 @@ class Worlds:
         self._metrics.update(signals, {name: mask.reshape(shape) for name, mask in masks.items()})
 
     def _checked(self, action: npt.ArrayLike) -> Array:
-        values = np.asarray(action, dtype=np.float64)
         shape = (self.num_worlds, len(self._bound))
-        if values.shape != shape:
-            expected = shape[1:] if self.num_worlds == 1 else shape
-            given = values.shape[1:] if self.num_worlds == 1 and values.ndim > 0 else values.shape
-            raise ActionError(
-                f"an action must have shape {expected} [rad], within ±{self._bound.max():g} rad; got shape {given}"
-            )
+        bounds = f"within ±{self._bound.max():g} rad"
+        given = np.asarray(action)
+        if given.dtype.kind not in "fiub":
+            raise ActionError(f"an action must be real numbers, {bounds}, got an array of {given.dtype}")
+        if given.shape != shape:
+            # a scalar environment adds the axis of worlds itself
+            expected, found = (shape[1:], given.shape[1:]) if self._is_scalar else (shape, given.shape)
+            raise ActionError(f"an action must have shape {expected} [rad], {bounds}; got shape {found}")
+        values = given.astype(np.float64)
         if not np.isfinite(values).all():
             worlds = np.flatnonzero(~np.isfinite(values).all(axis=1))
             raise ActionError(
-                f"an action must be finite, within ±{self._bound.max():g} rad, shape {shape[1:]} a world; "
+                f"an action must be finite, {bounds}, shape {shape[1:]} a world; "
                 f"got {values[worlds[0]]} in world {worlds[0]}"
             )
         return values

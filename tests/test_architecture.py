@@ -64,7 +64,8 @@ def test_nobody_draws_from_global_randomness(file: Path) -> None:
 
 
 LAYERS = [
-    ("errors", "config", "signals", "headless"),
+    ("errors", "config", "signals", "headless", "step_info"),
+    ("rows",),
     ("elasticity", "sensors", "metrics", "plan"),
     ("rigid_body",),
     ("walking",),

@@ -43,7 +43,7 @@ def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray
     values, sampled = log
     running = RunningStatistics(1, values.shape[1])
     for row, mask in zip(values, sampled, strict=True):
-        running.update(row[None], mask[None])
+        running.update(row[None, None], mask[None, None])
     for name, function in STATISTICS.items():
         result = running.statistic(name, 0)
         for world in range(values.shape[1]):
@@ -86,3 +86,17 @@ def test_values_do_not_share_memory_with_what_comes_later() -> None:
     values = metrics.values()
     metrics.update({"x": np.full(1, 9.0), "y": np.ones(1)}, masks([True]))
     assert all(value[0] == 1.0 for value in values.values())
+
+
+@given(log=logs, split=st.integers(0, 12))
+def test_how_many_steps_are_taken_at_once_does_not_matter(log: tuple[Array, BoolArray], split: int) -> None:
+    """Catches sums that depend on the grouping of steps, and so on when other worlds end: equal to the last bit."""
+    values, sampled = log
+    one_by_one, grouped = RunningStatistics(1, values.shape[1]), RunningStatistics(1, values.shape[1])
+    for row, mask in zip(values, sampled, strict=True):
+        one_by_one.update(row[None, None], mask[None, None])
+    for part in (slice(None, split), slice(split, None)):
+        if len(values[part]):
+            grouped.update(values[part, None], sampled[part, None])
+    for name in STATISTICS:
+        np.testing.assert_array_equal(grouped.statistic(name, 0), one_by_one.statistic(name, 0))

@@ -121,7 +121,7 @@ class WalkSample(Rows):
 
 def rms(values: Array) -> Array:
     """Root of the mean square over the last axis."""
-    return np.sqrt(np.einsum("...i,...i", values, values) / values.shape[-1])
+    return np.sqrt(np.vecdot(values, values) / values.shape[-1])
 
 
 def rotation_of(quaternion: Array) -> Array:
