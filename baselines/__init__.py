@@ -8,7 +8,17 @@ action, state = policy.predict(observation)
 import elastic_env  # noqa: F401  first: it chooses MuJoCo's OpenGL before anything imports MuJoCo
 from baselines.compensated import Compensated
 from baselines.compensators import DynamicCompensator, GravityCompensator
+from baselines.correction import Corrected, ResidualSettings
 from baselines.policies import make, policy_names
 from baselines.policy import Policy
 
-__all__ = ["Compensated", "DynamicCompensator", "GravityCompensator", "Policy", "make", "policy_names"]
+__all__ = [
+    "Compensated",
+    "Corrected",
+    "DynamicCompensator",
+    "GravityCompensator",
+    "Policy",
+    "ResidualSettings",
+    "make",
+    "policy_names",
+]

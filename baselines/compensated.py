@@ -45,30 +45,56 @@ class Compensated:
         Raises:
             ElasticError: Called in the middle of an episode without the state of the last call.
         """
+        return self.predict_corrected(observation, None, state, episode_start, deterministic)
+
+    def predict_corrected(
+        self,
+        observation: Array,
+        correction: Array | None,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Action, Any]:
+        """`predict` with another model of the joints: the deflection that is compensated, and seen, is (1 + r) δ.
+
+        Args:
+            observation: As in `predict`.
+            correction: Relative change r of the deflection, (num_worlds, n) [1]; None for none. Zeros are the same to
+                the last bit.
+            state: As in `predict`.
+            episode_start: As in `predict`.
+            deterministic: As in `predict`.
+        """
         rows = self._view.rows(observation)
         desired, compensator = self._view.motion(rows), self.compensator.at(rows)
         memory, inner_state = resume(
             state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1, 0)))
         )
-        seen = self._seen(compensator, rows, memory[:, 1:])
+        seen = self._seen(compensator, rows, memory[:, 1:], correction)
         action, inner_state = self.policy.predict(
             seen if observation.ndim > 1 else seen[0], inner_state, episode_start, deterministic
         )
         action = np.atleast_2d(np.asarray(action, dtype=np.float64))
         offset, kept = compensator.offset(desired.shifted(action), memory[:, 1:])
+        if correction is not None:
+            offset = offset + correction * compensator.deflection(offset, kept)
         steps = memory[:, :1] + 1.0
         total = (action + self._ramp.share(steps) * offset).astype(np.float32)
         return total.reshape((*observation.shape[:-1], total.shape[-1])), (np.hstack([steps, kept]), inner_state)
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:
+    def link_estimate(self, observation: Array, state: Any, correction: Array | None = None) -> Array:
         """Estimated link angle for an observation and the state that `predict` returned for it, (..., n) [rad]."""
         memory, _ = state
         rows = self._view.rows(observation)
-        estimate = self.compensator.at(rows).link_angle(self._view.theta(rows), memory[:, 1:])
+        estimate = self._links(self.compensator.at(rows), self._view.theta(rows), memory[:, 1:], correction)
         return estimate.reshape((*observation.shape[:-1], estimate.shape[-1]))
 
-    def _seen(self, compensator: Compensator, rows: Array, memory: Array) -> Array:
+    def _links(self, compensator: Compensator, theta: Array, memory: Array, correction: Array | None) -> Array:
+        q = compensator.link_angle(theta, memory)
+        return q if correction is None else q - correction * (theta - q)
+
+    def _seen(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
         """The observations with the links' angles and rates where they have the encoders'."""
         theta, theta_dot = self._view.theta(rows), self._view.theta_dot(rows)
         rate = compensator.link_rate(theta, theta_dot) if self._shows_rates else theta_dot
-        return self._view.with_links(rows, compensator.link_angle(theta, memory), rate)
+        return self._view.with_links(rows, self._links(compensator, theta, memory, correction), rate)

@@ -91,6 +91,10 @@ class Compensator(Protocol):
         """Command offset for the coming control period, (num_worlds, n) [rad], and the new memory."""
         ...
 
+    def deflection(self, offset: Array, memory: Array) -> Array:
+        """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n) [rad]."""
+        ...
+
     def link_angle(self, theta: Array, memory: Array) -> Array:
         """Estimate of q from the encoders, (num_worlds, n) [rad]."""
         ...
@@ -139,6 +143,10 @@ class GravityCompensator:
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
         """See `Compensator`."""
         return input_offset(motion.q, self.stiffness, self.gravity), memory
+
+    def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
+        """See `Compensator`: all of the offset."""
+        return offset
 
     def link_angle(self, theta: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
         """See `Compensator`."""
@@ -231,6 +239,10 @@ class DynamicCompensator:
         held_too_early = 0.5 * self._dt * theta_dot
         offset = deflection + servo_error - held_too_early
         return offset, np.concatenate([deflection, rate, windup, friction], axis=-1)
+
+    def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
+        """See `Compensator`: the offset less what the servo needs."""
+        return memory[..., : self._n]
 
     def link_angle(self, theta: Array, memory: Array) -> Array:
         """See `Compensator`: the deflection of the desired motion, or of the measured wrenches, off the encoder."""

@@ -5,6 +5,7 @@ and shows it compensated encoder readings. The named policies are such compositi
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from baselines.compensated import Compensated
@@ -12,6 +13,7 @@ from baselines.compensators import DynamicCompensator, GravityCompensator, Outpu
 from baselines.gravity_torque import GravityMethod
 from baselines.oracle import Oracle
 from baselines.policy import Policy, Zero
+from baselines.residual import read_description, residual_policy
 from baselines.walking_controller import WalkingController, WalkingGains
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
@@ -105,6 +107,10 @@ _ON_THE_WALKER: dict[str, tuple[Builder, tuple[str, ...]]] = {
 """The same. The controller alone assumes K too, for the ankles' offsets and the friction."""
 
 
+RESIDUAL = "residual:"
+"""Before the folder of a trained residual."""
+
+
 def policy_names() -> list[str]:
     """Names that `make` accepts."""
     return list(_ON_THE_WALKER | _ON_THE_TESTBED)
@@ -123,6 +129,7 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
     | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
+    | `residual:PATH` | a trained residual from its folder, around its base | the same |
 
     Args:
         name: As in the table.
@@ -136,8 +143,10 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     Raises:
         ConfigurationError: Unknown name or option, one without effect, or an environment that is not ours.
     """
+    if name.startswith(RESIDUAL):
+        return _residual(Path(name.removeprefix(RESIDUAL)), env, options)
     if name not in policy_names():
-        raise unknown_name("policy", name, policy_names())
+        raise unknown_name("policy", name, [*policy_names(), f"{RESIDUAL}PATH"])
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
@@ -151,6 +160,16 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     build, usable = known[name]
     _require_effect(name, env, given, usable)
     return build(env, _assumed(env, chosen), chosen)
+
+
+def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
+    """A trained residual around its base, whose options may be given anew."""
+    description = read_description(folder)
+    task = env.unwrapped.task.name
+    if description.robot != task:
+        raise ConfigurationError(f"{folder} is a residual for the {description.robot}, the environment is the {task}")
+    base = make(description.base, env, **{**description.base_options, **options})
+    return residual_policy(folder, base, env.unwrapped.assumed_model)
 
 
 def _require_effect(name: str, env: Any, given: Iterable[str], usable: Sequence[str]) -> None:

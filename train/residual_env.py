@@ -1,0 +1,245 @@
+"""Environments in which an agent decides the residual of a base policy, for one world and for many.
+
+A step is a decision: the residual is held for `decision_period` control steps behind its low-pass, the base policy
+commands the robot, rewards are summed, and the next observation is that of the next decision. A world that ends inside
+a decision takes no further part in it: its observation and reward are those up to its end.
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+import baselines
+from baselines.correction import Corrected, Features, ResidualSettings, Space
+from baselines.policy import Policy
+from elastic_env.errors import ActionError, ConfigurationError
+from elastic_env.signals import Array, BoolArray
+
+
+class _Deciding:
+    """Base policy, correction and features of some worlds, and their memories."""
+
+    def __init__(self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int) -> None:
+        if not hasattr(env.unwrapped, "assumed_model"):
+            raise ConfigurationError(f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}")
+        policy = baselines.make(base, env) if isinstance(base, str) else base
+        self.settings = settings
+        self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
+        self.features = Features(self.corrected)
+        self._num_worlds = num_worlds
+        self.begin(np.ones(num_worlds, dtype=np.bool_))
+        self._state: Any = None
+        self._past: Array | None = None
+
+    def begin(self, worlds: BoolArray) -> None:
+        """Episodes begin in some worlds, a (num_worlds,) mask."""
+        self._start, self._fresh = worlds.copy(), worlds.copy()
+        if worlds.all():
+            self._state = self._past = None
+
+    def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
+        """Features of the coming decision; the measurements count for some worlds only, or for all."""
+        features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
+        self._past = past if worlds is None or self._past is None else np.where(worlds[:, None], past, self._past)
+        self._fresh = np.zeros_like(self._fresh)
+        return features
+
+    def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
+        """Commands of the corrected base for a control step."""
+        action, self._state = self.corrected.act(observation, residual, self._state, self._start)
+        self._start = np.zeros_like(self._start)
+        return action
+
+    def checked(self, residual: Any, shape: tuple[int, ...]) -> Array:
+        """A residual as numbers within [−1, 1]."""
+        given = np.asarray(residual, dtype=np.float64)
+        if given.shape != shape or not np.isfinite(given).all():
+            raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {residual!r}")
+        return np.clip(given, -1.0, 1.0)
+
+
+def _settings(
+    space: Space, scale: float | dict[str, float] | None, decision_period: int, further: dict[str, Any]
+) -> ResidualSettings:
+    return ResidualSettings(space=space, scale=scale, decision_period=decision_period, **further)
+
+
+class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """One world whose action is the residual of a base policy, [−1, 1]^k.
+
+    Args:
+        env: An environment of ours.
+        base_policy: A policy for it, or the name of one.
+        space: "model" or "joint", see `baselines.correction`.
+        scale: Correction at a residual of 1.
+        decision_period: Control steps per decision.
+        **settings: Further parameters of `ResidualSettings`.
+
+    Raises:
+        ConfigurationError: Settings that are not valid, or that this base cannot have.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        base_policy: Policy | str,
+        space: Space = "model",
+        scale: float | dict[str, float] | None = None,
+        decision_period: int = 25,
+        **settings: Any,
+    ) -> None:
+        super().__init__(env)
+        self._deciding = _Deciding(env, base_policy, _settings(space, scale, decision_period, settings), 1)
+        self.observation_space = _box(self._deciding.features.width)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._deciding.corrected.num_corrected,), np.float32)
+        self._last = np.zeros(0)
+
+    @property
+    def settings(self) -> ResidualSettings:
+        """How the residual acts."""
+        return self._deciding.settings
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        self._last, info = self.env.reset(seed=seed, options=options)
+        self._deciding.begin(np.ones(1, dtype=np.bool_))
+        return self._deciding.observe(self._last[None])[0], info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One decision."""
+        residual = self._deciding.checked(action, self.action_space.shape or ())[None]
+        total, terminated, truncated, info = 0.0, False, False, {}
+        for _ in range(self.settings.decision_period):
+            command = self._deciding.act(self._last[None], residual)[0]
+            self._last, reward, terminated, truncated, info = self.env.step(command)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        return self._deciding.observe(self._last[None])[0], total, terminated, truncated, info
+
+
+class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
+    """Many worlds whose actions are residuals of a base policy, (num_envs, k).
+
+    It restarts worlds itself, in the autoreset mode that the environment had, between decisions only.
+
+    Args:
+        env: A vector environment of ours.
+        base_policy: A policy for it, or the name of one.
+        space: "model" or "joint", see `baselines.correction`.
+        scale: Correction at a residual of 1.
+        decision_period: Control steps per decision.
+        **settings: Further parameters of `ResidualSettings`.
+
+    Raises:
+        ConfigurationError: Settings that are not valid, or that this base cannot have.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.vector.VectorEnv[Any, Any, Any],
+        base_policy: Policy | str,
+        space: Space = "model",
+        scale: float | dict[str, float] | None = None,
+        decision_period: int = 25,
+        **settings: Any,
+    ) -> None:
+        super().__init__(env)
+        chosen = _settings(space, scale, decision_period, settings)
+        self._deciding = _Deciding(env, base_policy, chosen, env.num_envs)
+        inner: Any = env.unwrapped
+        self.autoreset_mode = inner.autoreset_mode
+        inner.autoreset_mode = AutoresetMode.DISABLED
+        inner.metadata = {**inner.metadata, "autoreset_mode": AutoresetMode.DISABLED}
+        self.metadata = {**inner.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = _box(self._deciding.features.width)
+        self.single_action_space = gymnasium.spaces.Box(
+            -1.0, 1.0, (self._deciding.corrected.num_corrected,), np.float32
+        )
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
+        self._rows = np.zeros((env.num_envs, 0))
+        self._done = np.zeros(env.num_envs, dtype=np.bool_)
+
+    @property
+    def settings(self) -> ResidualSettings:
+        """How the residual acts."""
+        return self._deciding.settings
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every world, or in those of options["reset_mask"]."""
+        self._rows, info = self.env.reset(seed=seed, options=options)
+        mask = np.ones(self.num_envs, dtype=np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+        self._deciding.begin(mask)
+        self._done = self._done & ~mask
+        return self._deciding.observe(self._rows), info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One decision in every world."""
+        residual = self._deciding.checked(actions, self.action_space.shape or ())
+        waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
+        outcome = self._decide(residual, ~waiting)
+        features = self._deciding.observe(outcome.rows)
+        info = outcome.info
+        self._done = outcome.terminated | outcome.truncated
+        if waiting.any():
+            features = self._restarted(waiting, features)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
+            ended = self._done.copy()
+            final = np.full(self.num_envs, None, dtype=object)
+            for world in np.flatnonzero(ended):
+                final[world] = features[world].copy()
+            final_info = dict(info)
+            features = self._restarted(ended, features)
+            info = {"final_obs": final, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
+        return features, outcome.reward, outcome.terminated, outcome.truncated, info
+
+    def _restarted(self, worlds: BoolArray, features: Array) -> Array:
+        """Features with those of new episodes in some worlds."""
+        self._rows, _ = self.env.reset(options={"reset_mask": worlds})
+        self._done = self._done & ~worlds
+        self._deciding.begin(worlds)
+        return np.where(worlds[:, None], self._deciding.observe(self._rows, worlds), features)
+
+    def _decide(self, residual: Array, alive: BoolArray) -> "_Outcome":
+        """Hold a residual for a decision period in the worlds that are alive."""
+        n = self.num_envs
+        reward, terminated, truncated = np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        final: Array = self._rows
+        metrics: dict[str, Any] = {}
+        reason = np.full(n, "", dtype="<U16")
+        for _ in range(self.settings.decision_period):
+            command = self._deciding.act(self._rows, residual)
+            self._rows, gained, fell, finished, info = self.env.step(command)
+            reward += np.where(alive, gained, 0.0)
+            ended = alive & (fell | finished)
+            final = np.where(alive[:, None], self._rows, final)
+            if ended.any():
+                terminated, truncated = terminated | (ended & fell), truncated | (ended & finished)
+                reason = np.where(ended, info["termination"], reason)
+                for name, values in info["episode_metrics"].items():
+                    metrics[name] = np.where(ended, values, metrics.get(name, np.zeros_like(values)))
+                alive = alive & ~ended
+                if not alive.any():
+                    break
+        info = {"termination": reason}
+        if metrics:
+            info |= {"episode_metrics": metrics, "_episode_metrics": terminated | truncated}
+        return _Outcome(final, reward, terminated, truncated, info)
+
+
+class _Outcome:
+    """What a decision came to."""
+
+    def __init__(self, rows: Array, reward: Array, terminated: BoolArray, truncated: BoolArray, info: dict[str, Any]):
+        self.rows, self.reward, self.terminated, self.truncated, self.info = rows, reward, terminated, truncated, info
+
+
+def _box(width: int) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-np.inf, np.inf, (width,), np.float64)
