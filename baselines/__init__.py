@@ -9,10 +9,11 @@ import elastic_env  # noqa: F401  first: it chooses MuJoCo's OpenGL before anyth
 from baselines.compensated import Compensated
 from baselines.compensators import DynamicCompensator, GravityCompensator
 from baselines.correction import Corrected, ResidualSettings
-from baselines.policies import make, policy_names
+from baselines.policies import RESIDUAL, make, policy_names
 from baselines.policy import Policy
 
 __all__ = [
+    "RESIDUAL",
     "Compensated",
     "Corrected",
     "DynamicCompensator",

@@ -22,6 +22,9 @@ from elastic_env.signals import Array
 
 DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
 
+_BLOCK = 32
+"""Rows that are multiplied at once: a larger product would be shared out to threads, which then wait busily for more
+work in the way of the physics."""
 _ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
 
 
@@ -88,6 +91,10 @@ class Network:
 
     def __call__(self, features: Array) -> Array:
         """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
+        blocks = [self._forward(features[i : i + _BLOCK]) for i in range(0, len(features), _BLOCK)]
+        return np.concatenate(blocks) if blocks else np.zeros((0, self.num_outputs))
+
+    def _forward(self, features: Array) -> Array:
         x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
         for number, (W, b) in enumerate(self._layers):
             x = x @ W + b

@@ -34,6 +34,7 @@ from tests.test_identification import synthetic
 from train.cli import main
 from train.compare import CompareConfig
 from train.conditions import Condition, PolicySpec
+from train.contenders import RawWorlds, VectorLoop
 from train.evaluate import Evaluation, evaluate
 from train.play import play
 from train.runs import new_run, run_folder
@@ -581,30 +582,46 @@ def test_identify_writes_result_and_figure(monkeypatch: pytest.MonkeyPatch, caps
     assert [text for text in ("888.0", "5.40", "hysteresis", "result/identification.json") if text not in printed] == []
 
 
-def test_speed_writes_every_size_that_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a size that is measured and not reported, and threads that are not those asked for."""
-    main(["speed", "--num-envs", "4", "2", "--steps", "5", "--rounds", "2", "--threads", "1"])
+SPEED = ["speed", "--steps", "3", "--rounds", "1", "--threads", "1"]
+
+
+def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a contender that is measured and not reported, and one that is compared with another's reference."""
+    main([*SPEED, "--env", "testbed", "--num-envs", "4", "2", "--processes", "1", "--no-ppo", "--profile"])
     results = json.loads(Path("runs/speed/speed.json").read_text())
-    assert [(r["num_envs"], r["threads"]) for r in results] == [(4, 1), (2, 1)]
+    found = [(r["contender"], r["num_envs"], r["against"]) for r in results]
+    loops = ["vector env", "raw mj_step", "vector env with input", "vector env with input and residual network"]
+    assert found[:8] == [(loop, n, f"raw mj_step, {n}") for n in (4, 2) for loop in loops]
+    assert found[8:10] == [(name, 1, "plain mj_step loop, 1") for name in ("plain mj_step loop", "scalar env")]
+    others = ["Gymnasium AsyncVectorEnv", "SB3 SubprocVecEnv", "Gymnasium SyncVectorEnv", "SB3 DummyVecEnv"]
+    assert found[10:] == [(name, 1, "vector env, 4") for name in others]
     for result in results:
-        assert min(result["env_steps_per_s"], result["raw_steps_per_s"], result["ratio"]) > 0.0
+        assert min(result["steps_per_s"], result["ratio"]) > 0.0
+        assert result["contender"] not in ("raw mj_step", "plain mj_step loop") or result["ratio"] == 1.0
+    assert "predict" in Path("runs/speed/profile.txt").read_text()
     assert "runs/speed/speed.json" in capsys.readouterr().out
 
 
-def test_raw_stepping_does_the_work_of_the_environment() -> None:
+def test_speed_of_learning_end_to_end() -> None:
+    """Catches a PPO that collects in one place and is timed in another."""
+    main([*SPEED, "--env", "testbed", "--num-envs", "2", "--no-others"])
+    ours, processes = json.loads(Path("runs/speed/speed.json").read_text())[-2:]
+    assert (ours["contender"], ours["num_envs"]) == ("PPO with input, vector env", 64)
+    assert processes["contender"] == "PPO with input, SubprocVecEnv(2)"
+    assert processes["against"] == "PPO with input, vector env, 64"
+    assert 0.0 < processes["ratio"] < 1.0
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_raw_stepping_does_the_work_of_the_environment(residual: bool) -> None:
     """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
-    reference = {"kind": "sine", "middle": 0.5, "amplitude": 0.005, "duration_s": 0.1, "onset_s": 0.2}
-    env = train.evaluate.make_vector_env(condition(reference=reference), 3, num_threads=1)
-    env.reset(seed=0)
-    inside = env.unwrapped
-    raw = train.speed._RawWorlds(inside.task, inside.simulation, threads=2)
-    controls = np.empty((300, *inside.simulation.ctrl.shape))
-    for step in range(300):
-        env.step(np.full((3, 1), 0.01, dtype=np.float32))
-        controls[step] = inside.simulation.ctrl
-    raw.run(controls)
+    loop = VectorLoop("testbed", 3, 1, "input", residual=residual)
+    inside = loop.env.unwrapped
+    raw = RawWorlds(loop, threads=2)
+    loop.run(300)
+    raw.run(300)
     data, kind = mujoco.MjData(inside.task.model), int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    for state, qpos, qvel in zip(raw._states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
+    for state, qpos, qvel in zip(raw.states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
         mujoco.mj_setState(inside.task.model, data, state, kind)
         np.testing.assert_array_equal(data.qpos, qpos)
         np.testing.assert_array_equal(data.qvel, qvel)

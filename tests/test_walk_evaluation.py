@@ -1,6 +1,5 @@
 """Evaluating a walk: the error of the local frame against Eq. 1, records, tables, figures, sweeps, and the commands."""
 
-import json
 from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
@@ -15,7 +14,6 @@ from PIL import Image
 from rich.console import Console
 
 import train.compare
-import train.speed
 from baselines.walking_controller import LocalFrame, local_frame
 from elastic_env.config import load_yaml
 from elastic_env.robots.robot_model import WalkerModel
@@ -25,6 +23,7 @@ from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
 from train.cli import main
 from train.compare import CompareConfig, try_out
 from train.conditions import Condition, PolicySpec
+from train.contenders import RawWorlds, VectorLoop
 from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
 from train.summary import failure_notes, print_summary, summary_table, write_summary
@@ -463,28 +462,15 @@ def leaning(env: Any) -> Leaning:
     return Leaning()
 
 
-def test_speed_of_the_walker_with_a_policy(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a measurement of the testbed under the walker's name."""
-    main(["speed", "--env", "walker", "--policy", "input_wrench", "--num-envs", "2", "--steps", "3", "--rounds", "1"])
-    (result,) = json.loads(Path("runs/speed/speed.json").read_text())
-    assert (result["env"], result["policy"], result["num_envs"]) == ("walker", "input_wrench", 2)
-    assert result["ratio"] > 0.0
-    assert "walker with input_wrench" in capsys.readouterr().out
-
-
 def test_raw_stepping_walks_as_the_environment_does() -> None:
     """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
-    env = make_vector_env(walk(), 3, num_threads=1)
-    env.reset(seed=0)
-    inside = env.unwrapped
-    raw = train.speed._RawWorlds(inside.task, inside.simulation, threads=2)
-    controls = np.empty((300, *inside.simulation.ctrl.shape))
-    for step in range(300):
-        env.step(np.full((3, 12), 0.01, dtype=np.float32))
-        controls[step] = inside.simulation.ctrl
-    raw.run(controls)
+    loop = VectorLoop("walker", 3, 1, "input_wrench", residual=True)
+    inside = loop.env.unwrapped
+    raw = RawWorlds(loop, threads=2)
+    loop.run(300)
+    raw.run(300)
     data, kind = mujoco.MjData(inside.task.model), int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    for state, qpos, qvel in zip(raw._states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
+    for state, qpos, qvel in zip(raw.states, inside.simulation.qpos, inside.simulation.qvel, strict=True):
         mujoco.mj_setState(inside.task.model, data, state, kind)
         np.testing.assert_array_equal(data.qpos, qpos)
         np.testing.assert_array_equal(data.qvel, qvel)

@@ -130,17 +130,28 @@ class Compare:
 
 @dataclass
 class Speed:
-    """Measure the vector environment against raw mj_step on the same model, in one interleaved run.
+    """Measure throughput against raw mj_step on the same model, in one interleaved run.
 
-    Example, with a policy in the loop: elastic speed --env walker --policy input_wrench --num-envs 64
+    Timed are the vector environment, without and with a policy and a residual network in its loop; scalar environments,
+    under the vector environments of Gymnasium and SB3 too; and PPO end to end.
+
+    Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024 --no-others --no-ppo
     """
 
-    env: str = "testbed"
+    env: str = "walker"
     """Environment: testbed or walker."""
     policy: str | None = None
-    """Baseline in the loop of the vector environment, or "module:function"; none by default."""
-    num_envs: list[int] = field(default_factory=lambda: [64, 1024])
+    """Baseline in the loop, or "module:function"; default input_wrench on the walker, input on the testbed."""
+    num_envs: list[int] = field(default_factory=lambda: [64, 256])
     """Numbers of worlds."""
+    others: bool = True
+    """Time scalar environments too, alone and in vector environments of Gymnasium and SB3."""
+    processes: list[int] = field(default_factory=lambda: [2, 4])
+    """Numbers of processes to try with them."""
+    ppo: bool = True
+    """Time PPO end to end too."""
+    profile: bool = False
+    """Say where the time of the vector environment with its policy goes."""
     steps: int = 50
     """Control steps per round."""
     rounds: int = 7
@@ -155,8 +166,9 @@ class Speed:
         from train.speed import SpeedConfig, measure_all
 
         with _options_named():
-            config = SpeedConfig(**{name: value for name, value in vars(self).items() if name != "output"})
-        _CONSOLE.print(f"wrote {measure_all(config, _CONSOLE, self.output)}", soft_wrap=True)
+            given = {name: value for name, value in vars(self).items() if name not in ("output", "profile")}
+            config = SpeedConfig(**given)
+        _CONSOLE.print(f"wrote {measure_all(config, _CONSOLE, self.output, self.profile)}", soft_wrap=True)
 
 
 @dataclass

@@ -69,7 +69,7 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
         ConfigurationError: The name is neither a baseline nor an importable function.
     """
     options = spec.options if options is None else options
-    if ":" not in spec.name:
+    if ":" not in spec.name or spec.name.startswith(baselines.RESIDUAL):
         return baselines.make(spec.name, env, **options)
     module, _, attribute = spec.name.partition(":")
     if not module or module.startswith("."):
@@ -90,7 +90,12 @@ def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
     )
 
 
-def make_vector_env(condition: Condition, num_envs: int, num_threads: int = 0) -> Any:
+def make_vector_env(
+    condition: Condition,
+    num_envs: int,
+    num_threads: int = 0,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+) -> Any:
     """The vector environment of a condition.
 
     Raises:
@@ -101,7 +106,7 @@ def make_vector_env(condition: Condition, num_envs: int, num_threads: int = 0) -
         num_envs=num_envs,
         vectorization_mode="vector_entry_point",
         num_threads=num_threads,
-        autoreset_mode=AutoresetMode.NEXT_STEP,
+        autoreset_mode=autoreset_mode,
         **condition.arguments,
     )
 

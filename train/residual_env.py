@@ -68,7 +68,7 @@ def _settings(
     return ResidualSettings(space=space, scale=scale, decision_period=decision_period, **further)
 
 
-class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
+class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """One world whose action is the residual of a base policy, [−1, 1]^k.
 
     Args:
@@ -92,7 +92,10 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
         decision_period: int = 25,
         **settings: Any,
     ) -> None:
-        super().__init__(env)
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, base_policy=base_policy, space=space, scale=scale, decision_period=decision_period, **settings
+        )
+        gymnasium.Wrapper.__init__(self, env)
         self._deciding = _Deciding(env, base_policy, _settings(space, scale, decision_period, settings), 1)
         self.observation_space = _box(self._deciding.features.width)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._deciding.corrected.num_corrected,), np.float32)
@@ -179,6 +182,26 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._deciding.begin(mask)
         self._done = self._done & ~mask
         return self._deciding.observe(self._rows), info
+
+    def spread(self, features: Array, generator: np.random.Generator) -> Array:
+        """Let the base walk until the worlds are spread evenly over an episode, at decisions drawn from a generator.
+
+        Call it after `reset` with what that returned; learning that begins with all worlds in the same phase of the
+        walk would see one phase at a time.
+        """
+        length = -(-self.env.unwrapped.task.num_steps // self.settings.decision_period)  # type: ignore[attr-defined]
+        begin = generator.permutation(np.arange(self.num_envs) * length // self.num_envs)
+        idle = np.zeros(self.action_space.shape or ())
+        for decision in range(length):
+            begins = begin == decision
+            if decision > 0 and begins.any():
+                features = self._restarted(begins, features)
+            outcome = self._decide(idle, np.ones(self.num_envs, dtype=np.bool_))
+            features = self._deciding.observe(outcome.rows)
+            ended = outcome.terminated | outcome.truncated
+            if ended.any():
+                features = self._restarted(ended, features)
+        return features
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One decision in every world."""

@@ -21,18 +21,22 @@ class SB3VecEnv(VecEnv):
 
     Args:
         env: With `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
+        spread: Generator that spreads the worlds over the episode at a reset, see `ResidualVectorWrapper.spread`; None
+            to begin all together.
 
     Raises:
         ConfigurationError: Another autoreset mode.
     """
 
-    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+    def __init__(
+        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], spread: np.random.Generator | None = None
+    ) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ConfigurationError(
                 f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
             )
-        self.env = env
+        self.env, self._spread = env, spread
         self._actions: Any = None
         self._reward, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -41,6 +45,8 @@ class SB3VecEnv(VecEnv):
         """Begin an episode in every world, with the seeds of the last call of `seed`."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observation, _ = self.env.reset(seed=seeds)
+        if self._spread is not None:
+            observation = self.env.spread(observation, self._spread)  # type: ignore[attr-defined]
         self._reset_seeds()
         self._reset_options()
         self._reward[:], self._length[:] = 0.0, 0

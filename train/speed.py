@@ -1,42 +1,54 @@
-"""Throughput of the vector environment against raw `mj_step` on the same model, as ratios of one interleaved run."""
+"""Throughput in one interleaved run: our vector environment against raw `mj_step`, scalar environments, and PPO."""
 
+import cProfile
 import json
 import os
+import pstats
 import statistics
-import threading
-import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import mujoco
-import numpy as np
 from pydantic import Field
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from rich.table import Table
 
 from elastic_env.config import Model, quantity
-from elastic_env.signals import Array
-from train.conditions import Condition, PolicySpec
-from train.environments import environment
-from train.evaluate import make_policy, make_vector_env
+from train.contenders import (
+    Contender,
+    GymnasiumLoop,
+    PlainLoop,
+    PPOLoop,
+    RawWorlds,
+    SB3Loop,
+    ScalarLoop,
+    VectorLoop,
+)
 from train.runs import run_folder
 
-_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_PPO_PROCESSES = 2
 
 
 class SpeedConfig(Model):
     """What `elastic speed` measures."""
 
-    env: str = "testbed"
+    env: str = "walker"
     policy: str | None = None
-    """Policy in the loop of the vector environment; None for none."""
-    num_envs: list[Annotated[int, Field(ge=1)]] = Field(default=[64, 1024], min_length=1)
+    """Policy in the loop of the vector environment, which is timed without, with it, and with a residual network; None
+    for input_wrench on the walker, input on the testbed."""
+    num_envs: list[Annotated[int, Field(ge=1)]] = Field(default=[64, 256], min_length=1)
     """Numbers of worlds."""
+    others: bool = True
+    """Whether scalar environments are timed too, alone and under Gymnasium's and SB3's vector environments."""
+    processes: list[Annotated[int, Field(ge=1)]] = Field(default=[2, 4], min_length=1)
+    """Numbers of processes to try with them; the fastest counts."""
+    ppo: bool = True
+    """Whether PPO is timed end to end, with ours and with processes."""
     steps: int = quantity("1", 50, ge=1, description="control steps per round")
     rounds: int = quantity("1", 7, ge=1, description="rounds, of which medians are reported")
-    threads: int = quantity("1", 0, ge=0, description="threads of both contenders, 0 for all cores")
+    threads: int = quantity("1", 0, ge=0, description="threads of the physics, 0 for all cores")
 
 
 @dataclass(frozen=True)
@@ -45,135 +57,121 @@ class SpeedResult:
 
     Attributes:
         env: Environment.
-        policy: Policy in its loop, None for none.
-        num_envs: Worlds of the vector environment.
-        threads: Threads of both contenders.
-        env_steps_per_s: Control steps per second of the vector environment, all worlds together.
-        raw_steps_per_s: The same of `mj_step` alone.
-        ratio: Median of the rounds' ratios.
+        contender: What was timed.
+        num_envs: Its worlds.
+        threads: Threads of the physics.
+        steps_per_s: Control steps per second, all worlds together.
+        ratio: Median of the rounds' ratios to `against`.
+        against: What the ratio refers to, with its worlds.
     """
 
     env: str
-    policy: str | None
+    contender: str
     num_envs: int
     threads: int
-    env_steps_per_s: float
-    raw_steps_per_s: float
+    steps_per_s: float
     ratio: float
+    against: str
 
 
-def measure(
-    num_envs: int, steps: int, rounds: int, threads: int = 0, env: str = "testbed", policy: str | None = None
-) -> SpeedResult:
-    """Time the vector environment, with a policy in its loop or without, and raw stepping in turn.
+@dataclass(frozen=True)
+class _Entry:
+    """A contender, and the number of the one that it is compared with."""
 
-    Raw stepping starts from the same states and plays the same servo inputs: on every thread nothing but writing `ctrl`
-    and one call of `mj_step` with all sub-steps of a control period.
+    contender: Contender
+    against: int
+
+
+def measure(config: SpeedConfig, progress: Callable[[], None] | None = None) -> list[SpeedResult]:
+    """Time all contenders in turn, round by round; the first round warms up.
 
     Args:
-        num_envs: Worlds.
-        steps: Control steps per round.
-        rounds: Rounds; the medians are reported.
-        threads: Threads, 0 for all cores.
-        env: Environment, with its default motion, scenario nominal.
-        policy: Its name; None plays zero offsets.
+        config: What to measure.
+        progress: Called after every contender of every round.
 
     Raises:
         ConfigurationError: Environment or policy does not exist.
     """
-    threads = min(threads or os.cpu_count() or 1, num_envs)
-    loop = _Loop(env, policy, num_envs, threads)
-    simulation = loop.env.unwrapped.simulation
-    raw = _RawWorlds(loop.env.unwrapped.task, simulation, threads)
-    env_times, raw_times = [], []
-    for _ in range(rounds + 1):
-        controls = np.empty((steps, *simulation.ctrl.shape))
-        begin = time.perf_counter()
-        for step in range(steps):
-            loop.step()
-            controls[step] = simulation.ctrl
-        env_times.append(time.perf_counter() - begin)
-        raw_times.append(raw.run(controls))
-    env_times, raw_times = env_times[1:], raw_times[1:]  # the first round warms up
-    work = num_envs * steps
+    entries = _entries(config)
+    try:
+        rates: list[list[float]] = [[] for _ in entries]
+        for _ in range(config.rounds + 1):
+            for entry, found in zip(entries, rates, strict=True):
+                found.append(entry.contender.run(config.steps))
+                if progress is not None:
+                    progress()
+    finally:
+        for entry in entries:
+            entry.contender.close()
+    return [_result(config, entries, rates, number) for number in range(len(entries))]
+
+
+def _entries(config: SpeedConfig) -> list[_Entry]:
+    """What is timed, every reference before or right after what is compared with it."""
+    threads, env = config.threads or os.cpu_count() or 1, config.env
+    policy = config.policy or {"walker": "input_wrench", "testbed": "input"}.get(env, "zero")
+    entries: list[_Entry] = []
+    for n in config.num_envs:
+        loop = VectorLoop(env, n, min(threads, n))
+        raw = len(entries) + 1
+        entries.append(_Entry(loop, raw))
+        entries.append(_Entry(RawWorlds(loop, min(threads, n)), raw))
+        entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy), raw))
+        entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy, residual=True), raw))
+    if config.others:
+        plain = len(entries)
+        entries += [_Entry(PlainLoop(env), plain), _Entry(ScalarLoop(env), plain)]
+        for count in config.processes:
+            entries.append(_Entry(GymnasiumLoop(env, "async", count), 0))
+            entries.append(_Entry(SB3Loop(env, "SubprocVecEnv", count), 0))
+        entries.append(_Entry(GymnasiumLoop(env, "sync", config.processes[0]), 0))
+        entries.append(_Entry(SB3Loop(env, "DummyVecEnv", config.processes[0]), 0))
+    if config.ppo:
+        ours = len(entries)
+        entries.append(_Entry(PPOLoop(env, policy, 64, threads), ours))
+        entries.append(_Entry(PPOLoop(env, policy, _PPO_PROCESSES, 1, processes=True), ours))
+    return entries
+
+
+def _result(config: SpeedConfig, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:
+    entry, reference = entries[number], entries[entries[number].against]
+    mine, others = rates[number][1:], rates[entry.against][1:]
     return SpeedResult(
-        env=env,
-        policy=policy,
-        num_envs=num_envs,
-        threads=threads,
-        env_steps_per_s=work / statistics.median(env_times),
-        raw_steps_per_s=work / statistics.median(raw_times),
-        ratio=statistics.median(r / e for e, r in zip(env_times, raw_times, strict=True)),
+        env=config.env,
+        contender=entry.contender.title,
+        num_envs=entry.contender.num_envs,
+        threads=config.threads or os.cpu_count() or 1,
+        steps_per_s=statistics.median(mine),
+        ratio=statistics.median(a / b for a, b in zip(mine, others, strict=True)),
+        against=f"{reference.contender.title}, {reference.contender.num_envs}",
     )
 
 
-class _Loop:
-    """The vector environment in a loop with a policy, or with zero offsets."""
+def profile(config: SpeedConfig) -> str:
+    """Where the time of the vector environment with its policy goes, as text."""
+    threads, n = config.threads or os.cpu_count() or 1, config.num_envs[0]
+    policy = config.policy or {"walker": "input_wrench", "testbed": "input"}.get(config.env)
+    loop = VectorLoop(config.env, n, min(threads, n), policy)
+    loop.run(config.steps)
+    profiler = cProfile.Profile()
+    profiler.enable()
+    loop.run(config.steps * config.rounds)
+    profiler.disable()
+    import io
 
-    def __init__(self, env: str, policy: str | None, num_envs: int, threads: int) -> None:
-        spec = PolicySpec(name=policy or "zero")
-        condition = Condition(env=env, policy=spec, reference=environment(env).default_reference)
-        self.env = make_vector_env(condition, num_envs, threads)
-        self._policy = None if policy is None else make_policy(spec, self.env)
-        self._action = np.zeros(self.env.action_space.shape, dtype=np.float32)
-        self._observation, _ = self.env.reset(seed=0)
-        self._state: Any = None
-        self._start, self._done = np.ones(num_envs, dtype=np.bool_), np.zeros(num_envs, dtype=np.bool_)
-
-    def step(self) -> None:
-        """One control period in every world."""
-        if self._policy is not None:
-            self._action, self._state = self._policy.predict(self._observation, self._state, self._start, True)
-        self._observation, _, terminated, truncated, _ = self.env.step(self._action)
-        self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
+    text = io.StringIO()
+    pstats.Stats(profiler, stream=text).strip_dirs().sort_stats("cumulative").print_stats(40)
+    return text.getvalue()
 
 
-class _RawWorlds:
-    """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm in its cache."""
-
-    def __init__(self, task: Any, simulation: Any, threads: int) -> None:
-        self._model, self._substeps = task.model, task.num_substeps
-        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
-        self._states = np.stack([self._state_of(simulation, world) for world in range(task.num_worlds)])
-
-    def run(self, controls: Array) -> float:
-        """Time to play servo inputs, (steps, num_worlds, nu), in every world [s]."""
-        workers = [threading.Thread(target=self._play, args=(i, controls)) for i in range(len(self._data))]
-        begin = time.perf_counter()
-        for worker in workers:
-            worker.start()
-        for worker in workers:
-            worker.join()
-        return time.perf_counter() - begin
-
-    def _play(self, thread: int, controls: Array) -> None:
-        model, data, substeps = self._model, self._data[thread], self._substeps
-        for world in range(thread, len(self._states), len(self._data)):
-            mujoco.mj_setState(model, data, self._states[world], _STATE)
-            ctrl = data.ctrl
-            for command in controls[:, world]:
-                ctrl[:] = command
-                mujoco.mj_step(model, data, substeps)
-            mujoco.mj_getState(model, data, self._states[world], _STATE)
-
-    def _state_of(self, simulation: Any, world: int) -> Array:
-        """Integration state of a world of the environment."""
-        data, state = self._data[0], np.empty(mujoco.mj_stateSize(self._model, _STATE))
-        mujoco.mj_resetData(self._model, data)
-        data.qpos[:], data.qvel[:] = simulation.qpos[world], simulation.qvel[world]
-        data.act[:], data.ctrl[:] = simulation.act[world], simulation.ctrl[world]
-        data.qacc_warmstart[:] = simulation.bind("qacc_warmstart")[world]
-        mujoco.mj_getState(self._model, data, state, _STATE)
-        return state
-
-
-def measure_all(config: SpeedConfig, console: Console, output: Path | None = None) -> Path:
-    """Measure every number of worlds, print the ratios, and write them as JSON.
+def measure_all(config: SpeedConfig, console: Console, output: Path | None = None, with_profile: bool = False) -> Path:
+    """Measure, print the ratios, and write them as JSON.
 
     Args:
         config: What to measure.
         console: Where progress and table go.
         output: Folder for the results; default runs/speed, numbered if taken.
+        with_profile: Whether to print where the time goes, and keep it beside.
 
     Returns:
         The file.
@@ -182,20 +180,26 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
         ConfigurationError: Environment or policy does not exist; found before the work begins.
         ResultsExistError: The output folder holds results.
     """
-    _Loop(config.env, config.policy, num_envs=1, threads=1)
+    VectorLoop(config.env, 1, 1, config.policy)
     with run_folder("speed", config.model_dump(mode="json"), None, output) as folder:
-        results = [
-            measure(n, config.steps, config.rounds, config.threads, config.env, config.policy)
-            for n in track(config.num_envs, "measuring", console=console, transient=True)
-        ]
+        with Progress(console=console, transient=True) as bar:
+            task = bar.add_task("measuring", total=None)
+            results = measure(config, lambda: bar.advance(task))
         path = folder / "speed.json"
         path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
-    loop = "" if config.policy is None else f" with {config.policy}"
-    table = Table(title=f"{config.env}{loop} against raw mj_step, medians of one interleaved run")
-    for name in ("worlds", "threads", "env steps/s", "raw steps/s", "ratio"):
-        table.add_column(name, justify="right")
-    for r in results:
-        rates = f"{r.env_steps_per_s:,.0f}", f"{r.raw_steps_per_s:,.0f}"
-        table.add_row(str(r.num_envs), str(r.threads), *rates, f"{r.ratio:.3f}")
-    console.print(table)
+        if with_profile:
+            text = profile(config)
+            (folder / "profile.txt").write_text(text)
+            console.print(text, highlight=False, markup=False)
+    console.print(_table(config, results))
     return path
+
+
+def _table(config: SpeedConfig, results: Sequence[SpeedResult]) -> Table:
+    table = Table(title=f"{config.env}: control steps per second, medians of one interleaved run")
+    for name, justify in (("", "left"), ("worlds", "right"), ("steps/s", "right"), ("ratio", "right"), ("to", "left")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for r in results:
+        row: tuple[Any, ...] = (r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against)
+        table.add_row(*row)
+    return table

@@ -1,0 +1,1 @@
+"""Benchmarks of the vector environments; not part of `make test`, see `make bench`."""

@@ -1,0 +1,360 @@
+"""Residuals: zero against the base to the last bit, scalar against vector, SB3 against NumPy, the checkers of both."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from safetensors.numpy import load_file, save_file
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+from stable_baselines3.common.vec_env import VecNormalize
+
+import baselines
+from baselines.correction import Corrected, Features, ResidualSettings
+from baselines.residual import Network, ResidualDescription, ResidualPolicy, load_residual, save_residual
+from elastic_env.errors import ActionError, ConfigurationError
+from elastic_env.signals import Array
+from train.export import network_of
+from train.residual_env import ResidualVectorWrapper, ResidualWrapper
+from train.sb3_env import SB3VecEnv
+
+WALKER, TESTBED = "elastic_env/WalkInPlace-v0", "elastic_env/Testbed-v0"
+QUICK = {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
+SINE = {"reference": {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}}
+BASES = [
+    ("walker", "input_open", "model"),
+    ("walker", "input_output", "model"),
+    ("walker", "input_wrench", "model"),
+    ("walker", "dynamic", "model"),
+    ("walker", "uncompensated", "joint"),
+    ("walker", "input_output", "joint"),
+    ("testbed", "input", "model"),
+    ("testbed", "dynamic", "model"),
+    ("testbed", "zero", "joint"),
+]
+
+
+def scalar(robot: str, **options: Any) -> gymnasium.Env[Any, Any]:
+    """A short episode of one world."""
+    name, short = (WALKER, QUICK) if robot == "walker" else (TESTBED, SINE)
+    return gymnasium.make(name, **{**short, **options})
+
+
+def vector(robot: str, n: int, mode: AutoresetMode = AutoresetMode.SAME_STEP, **options: Any) -> Any:
+    """Short episodes of many worlds."""
+    name, short = (WALKER, QUICK) if robot == "walker" else (TESTBED, SINE)
+    kind = {"vectorization_mode": "vector_entry_point", "num_envs": n, "autoreset_mode": mode}
+    return gymnasium.make_vec(name, **kind, **{**short, **options})
+
+
+def played(env: gymnasium.Env[Any, Any], policy: Any, steps: int) -> list[Array]:
+    """Observations of a policy's control steps."""
+    observation, _ = env.reset(seed=3)
+    seen, state = [observation], None
+    for _ in range(steps):
+        action, state = policy.predict(observation, state)
+        observation, _, terminated, truncated, _ = env.step(action)
+        seen.append(observation)
+        if terminated or truncated:
+            break
+    return seen
+
+
+class Deciding:
+    """A residual policy whose residuals are given, by corrected joint and decision."""
+
+    def __init__(self, corrected: Corrected, residuals: Array) -> None:
+        self.corrected, self.residuals, self.steps = corrected, residuals, 0
+
+    def predict(self, observation: Array, state: Any = None) -> tuple[Any, Any]:
+        """The correction of the present decision."""
+        decision = self.steps // self.corrected.settings.decision_period
+        self.steps += 1
+        action, state = self.corrected.act(observation, self.residuals[None, decision], state)
+        return action[0] if action.ndim > 1 else action, state
+
+
+def around(env: Any, base: str, **settings: Any) -> Corrected:
+    """A base under a residual."""
+    return Corrected(baselines.make(base, env), env.unwrapped.assumed_model, ResidualSettings(**settings))
+
+
+@pytest.mark.parametrize(("robot", "base", "space"), BASES)
+def test_a_zero_residual_is_the_base_to_the_last_bit(robot: str, base: str, space: Any) -> None:
+    """Catches a correction that rounds, a filter that starts elsewhere, and a base that sees it normalised."""
+    env = scalar(robot)
+    expected = played(env, baselines.make(base, env), 250)
+    corrected = around(env, base, space=space)
+    for seen in (
+        played(env, Deciding(corrected, np.zeros((20, corrected.num_corrected))), 250),
+        played(env, ResidualPolicy(corrected, nothing(corrected)), 250),
+    ):
+        assert len(seen) == len(expected) > 100
+        for one, other in zip(seen, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def nothing(corrected: Corrected) -> Network:
+    """A network that always gives zero."""
+    return random_network(corrected, 0.0)
+
+
+def random_network(corrected: Corrected, size: float, seed: int = 0) -> Network:
+    """A network of random weights."""
+    features, generator = Features(corrected).width, np.random.default_rng(seed)
+    widths = [features, 8, corrected.num_corrected]
+    tensors = {"mean": generator.normal(size=features), "std": generator.uniform(0.5, 2.0, features)}
+    for i in range(2):
+        tensors |= {
+            f"weight{i}": size * generator.normal(size=(widths[i + 1], widths[i])),
+            f"bias{i}": np.zeros(widths[i + 1]),
+        }
+    return Network(ResidualDescription(robot="walker", base="", settings=corrected.settings), tensors)
+
+
+def test_model_space_compensates_another_deflection() -> None:
+    """Catches a correction of the command alone: after the low-pass, r means K / (1 + r) in Eq. 9 and in Eq. 12."""
+    env, r = scalar("walker"), 0.25
+    corrected = around(env, "input_output", space="model", scale=1.0, cutoff_hz=1e6)
+    softer = baselines.make("input_output", env, stiffness_scale=1.0 / (1.0 + r))
+    observation, _ = env.reset(seed=1)
+    wanted, state = corrected.act(observation, np.full((1, 12), r))
+    action, softer_state = softer.predict(observation)
+    ramp = 3.0 * np.abs(action).max() + 1e-6  # the first step of the ramp: the controller's own K differs
+    np.testing.assert_allclose(wanted, action, rtol=0.0, atol=ramp)
+    plain = baselines.make("input_output", env)
+    _, plain_state = plain.predict(observation)
+    theta, q = observation[:12], plain.link_estimate(observation, plain_state)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(corrected.link_estimate(observation, state), theta - (1.0 + r) * (theta - q), atol=1e-15)
+    exact = softer.link_estimate(observation, softer_state)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(corrected.link_estimate(observation, state), exact, rtol=0.0, atol=2e-3)
+    assert np.abs(theta - q).max() > 0.01
+
+
+def test_the_correction_passes_a_first_order_low_pass() -> None:
+    """Catches a cut-off in rad/s, a filter that runs once per decision, and a scale of the wrong joint."""
+    env = scalar("testbed")
+    corrected = around(env, "zero", space="joint", scale=0.05, cutoff_hz=3.0)
+    observation, _ = env.reset(seed=0)
+    state, found = None, []
+    for _ in range(100):
+        action, state = corrected.act(observation, np.ones((1, 1)), state)
+        found.append(action[0] if action.ndim == 1 else action[0, 0])
+    expected = 0.05 * (1.0 - np.exp(-2.0 * math.pi * 3.0 * 0.004 * np.arange(1, 101)))
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-8)
+
+
+def test_joints_and_scales_are_chosen_by_name() -> None:
+    """Catches an order of joints that is not the robot's, and a scale that goes to another joint."""
+    env = scalar("walker")
+    settings = ResidualSettings(
+        space="joint", joints=("ankle_roll", "l_knee"), scale={"ankle_roll": 0.01, "knee": 0.03}
+    )
+    names = env.unwrapped.assumed_model.joint_names  # type: ignore[attr-defined]
+    assert [names[j] for j in settings.corrected_joints(names)] == ["l_knee", "l_ankle_roll", "r_ankle_roll"]
+    np.testing.assert_array_equal(settings.scales(names), [0.03, 0.01, 0.01])
+    with pytest.raises(ConfigurationError, match=r"'elbow'.*l_hip_yaw"):
+        ResidualSettings(joints=("elbow",)).corrected_joints(names)
+    with pytest.raises(ConfigurationError, match=r"every corrected joint.*l_hip_yaw"):
+        ResidualSettings(scale={"knee": 0.1}).scales(names)
+    with pytest.raises(ConfigurationError, match="compensates none; use space 'joint'"):
+        around(env, "uncompensated", space="model")
+
+
+@pytest.mark.parametrize(("robot", "base", "space"), BASES[1:5:3] + BASES[6:7])
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_a_vector_of_worlds_is_the_scalar_wrapper(robot: str, base: str, space: Any, mode: AutoresetMode) -> None:
+    """Catches rewards that go on after an end, worlds that begin inside a decision, and memories that are mixed up."""
+    further = {"history": 2, "observe_base_action": True, "decision_period": 20}
+    n, generator = 3, np.random.default_rng(0)
+    many = ResidualVectorWrapper(vector(robot, n, mode), base, space=space, **further)
+    ones = [ResidualWrapper(scalar(robot), base, space=space, **further) for _ in range(n)]
+    observation, _ = many.reset(seed=5)
+    expected = np.stack([one.reset(seed=5 + i)[0] for i, one in enumerate(ones)])
+    np.testing.assert_array_equal(observation, expected)
+    ended = np.zeros(n, dtype=bool)
+    ends = 0
+    for _ in range(40):
+        residual = generator.uniform(-1.0, 1.0, many.action_space.shape)
+        observation, reward, terminated, truncated, info = many.step(residual)
+        for i, one in enumerate(ones):
+            if mode is AutoresetMode.NEXT_STEP and ended[i]:
+                alone, _ = one.reset()
+                np.testing.assert_array_equal(observation[i], alone)
+                assert (reward[i], terminated[i], truncated[i]) == (0.0, False, False)
+                ended[i] = False
+                continue
+            alone, gained, fell, finished, last = one.step(residual[i])
+            assert (reward[i], terminated[i], truncated[i]) == (gained, fell, finished)
+            if not (fell or finished):
+                np.testing.assert_array_equal(observation[i], alone)
+                continue
+            ends += 1
+            final = info["final_obs"][i] if mode is AutoresetMode.SAME_STEP else observation[i]
+            np.testing.assert_array_equal(final, alone)
+            of_episode = info["final_info"] if mode is AutoresetMode.SAME_STEP else info
+            for name, value in last["episode_metrics"].items():
+                np.testing.assert_array_equal(of_episode["episode_metrics"][name][i], value)
+            if mode is AutoresetMode.SAME_STEP:
+                np.testing.assert_array_equal(observation[i], one.reset()[0])
+            else:
+                ended[i] = True
+    assert ends >= 3
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("robot", ["walker", "testbed"])
+def test_checkers_of_gymnasium_and_sb3_pass(robot: str) -> None:
+    """Catches an observation outside its space, a reset that does not seed, and an info that is no dictionary."""
+    base = "input_output" if robot == "walker" else "input"
+    check_env(ResidualWrapper(scalar(robot), base, history=1), skip_render_check=True)
+    check_env_of_sb3(ResidualWrapper(scalar(robot), base))
+
+
+def test_residuals_that_are_no_residuals_are_refused() -> None:
+    """Catches a wrong shape that broadcasts, and nan."""
+    env = ResidualWrapper(scalar("testbed"), "input")
+    env.reset(seed=0)
+    for wrong in (np.zeros(2), np.array([np.nan]), 0.5):
+        with pytest.raises(ActionError, match="finite numbers of shape"):
+            env.step(wrong)
+    with pytest.raises(ConfigurationError, match="must be SameStep"):
+        SB3VecEnv(vector("testbed", 2, AutoresetMode.NEXT_STEP))
+
+
+def test_sb3_gets_ends_as_it_reads_them() -> None:
+    """Catches a time limit that looks like a fall, a terminal observation of the next episode, and wrong returns."""
+    venv = SB3VecEnv(ResidualVectorWrapper(vector("testbed", 2), "input"))
+    venv.seed(3)
+    venv.reset()
+    total, length = np.zeros(2), 0
+    while True:
+        observation, reward, done, infos = venv.step(np.zeros((2, 1)))
+        total, length = total + reward, length + 1
+        if done.any():
+            break
+        assert infos == [{}, {}]
+    assert done.all()
+    for i, info in enumerate(infos):
+        assert info["TimeLimit.truncated"]
+        assert info["episode"]["r"] == pytest.approx(total[i], rel=1e-5)
+        assert info["episode"]["l"] == length
+        assert np.isfinite(info["episode_metrics"]["link_error_rms_rad"])
+        assert not np.array_equal(info["terminal_observation"], observation[i])
+
+
+def trained(algorithm: Any, **options: Any) -> tuple[Any, VecNormalize, ResidualVectorWrapper]:
+    """A little training on the testbed."""
+    torch.set_num_threads(1)
+    env = ResidualVectorWrapper(vector("testbed", 4), "input", history=1)
+    venv = VecNormalize(SB3VecEnv(env))
+    model = algorithm("MlpPolicy", venv, device="cpu", seed=0, policy_kwargs={"net_arch": [16, 16]}, **options)
+    model.learn(64)
+    return model, venv, env
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options"), [(PPO, {"n_steps": 8, "batch_size": 16}), (SAC, {"learning_starts": 8})]
+)
+def test_the_numpy_forward_pass_is_that_of_sb3(algorithm: Any, options: dict[str, Any], tmp_path: Path) -> None:
+    """Catches a layer, an activation, a normalisation or a squashing that is not the one that was trained."""
+    model, venv, env = trained(algorithm, **options)
+    tensors, activation, output = network_of(model, venv)
+    description = ResidualDescription(
+        robot="testbed", base="input", settings=env.settings, activation=activation, output=output
+    )
+    save_residual(tmp_path / "r", description, tensors)
+    read, network = load_residual(tmp_path / "r")
+    assert read == description
+    features = (
+        np.random.default_rng(1).normal(size=(100, network.num_features)) * tensors["std"] * 3.0 + tensors["mean"]
+    )
+    expected, _ = model.predict(venv.normalize_obs(features), deterministic=True)
+    np.testing.assert_allclose(network(features), expected, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(network(features[3:4])[0], network(features)[3], rtol=0.0, atol=1e-6)
+    assert np.abs(expected).max() > 1e-3
+
+
+def test_a_residual_of_a_folder_plays_what_the_wrapper_decided(tmp_path: Path) -> None:
+    """Catches a policy that decides at other steps, on other features, or around another base than in training."""
+    env = scalar("walker")
+    corrected = around(env, "input_output", history=2, observe_base_action=True, decision_period=10)
+    network = random_network(corrected, 0.3)
+    wrapper = ResidualWrapper(scalar("walker"), "input_output", history=2, observe_base_action=True, decision_period=10)
+    features, _ = wrapper.reset(seed=3)
+    seen = played(env, ResidualPolicy(corrected, network), 60)
+    for decision in range(6):
+        np.testing.assert_array_equal(features[:95], seen[10 * decision])
+        features, *_ = wrapper.step(network(features[None])[0])
+    np.testing.assert_array_equal(features[:95], seen[60])
+
+
+def folder(path: Path) -> Path:
+    """A residual for the testbed that is valid."""
+    env = scalar("testbed")
+    corrected = around(env, "input")
+    width = Features(corrected).width
+    tensors = {
+        "mean": np.zeros(width), "std": np.ones(width), "weight0": np.zeros((4, width)), "bias0": np.zeros(4),
+        "weight1": np.zeros((1, 4)), "bias1": np.zeros(1),
+    }  # fmt: skip
+    save_residual(path, ResidualDescription(robot="testbed", base="input"), tensors)
+    return path
+
+
+def test_make_reads_a_residual_and_runs_it_on_many_worlds(tmp_path: Path) -> None:
+    """Catches a residual that only its training can use."""
+    path = folder(tmp_path / "r")
+    envs = vector("testbed", 3, AutoresetMode.NEXT_STEP)
+    policy, base = baselines.make(f"residual:{path}", envs), baselines.make("input", envs)
+    observation, _ = envs.reset(seed=0)
+    np.testing.assert_array_equal(policy.predict(observation)[0], base.predict(observation)[0])
+    with pytest.raises(ConfigurationError, match="for the testbed, the environment is the walker"):
+        baselines.make(f"residual:{path}", scalar("walker"))
+
+
+def damaged(path: Path, **changes: Any) -> None:
+    """Change tensors of a residual; None leaves one out."""
+    tensors = load_file(path / "weights.safetensors") | changes
+    save_file({name: value for name, value in tensors.items() if value is not None}, path / "weights.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mean": None}, "must be mean, std, weight0"),
+        ({"bias1": np.array([np.nan])}, "finite"),
+        ({"std": np.zeros(6)}, "positive"),
+        ({"weight0": np.zeros((4, 5))}, r"shape \(4, 6\), got \(4, 5\)"),
+        ({"mean": np.zeros(7), "std": np.ones(7), "weight0": np.zeros((4, 7))}, "must take 6 features.*it has 7"),
+    ],
+)
+def test_a_damaged_residual_says_what_is_wrong(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    """Catches weights that run although they belong to something else."""
+    path = folder(tmp_path / "r")
+    damaged(path, **changes)
+    with pytest.raises(ConfigurationError, match=message):
+        baselines.make(f"residual:{path}", scalar("testbed"))
+
+
+def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> None:
+    """Catches a traceback for a path that is wrong, text that is no JSON, and a description of something else."""
+    env = scalar("testbed")
+    with pytest.raises(ConfigurationError, match=r"no residual at .*residual\.json"):
+        baselines.make(f"residual:{tmp_path}", env)
+    path = folder(tmp_path / "r")
+    for text, message in (("{", "is not JSON"), (json.dumps({"robot": "testbed"}), "base")):
+        (path / "residual.json").write_text(text)
+        with pytest.raises(ConfigurationError, match=message):
+            baselines.make(f"residual:{path}", env)
+    path = folder(tmp_path / "s")
+    (path / "weights.safetensors").write_bytes(b"\x80\x04pickle")
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        baselines.make(f"residual:{path}", env)
