@@ -121,6 +121,22 @@ class ManyWorlds:
         copied._batch.warning[:] = self._batch.warning
         return copied
 
+    def get_state(self) -> dict[str, Any]:
+        """Everything that goes on from here: integration states, outputs, warnings, varied fields of the model."""
+        outputs = {field: self.bind(field).copy() for field in sorted(self._bound)}
+        varied = {field: self.vary(field).copy() for field in sorted(self._varied)}
+        state, warning = self._batch.state.copy(), self._batch.warning.copy()
+        return {"state": state, "warning": warning, "outputs": outputs, "varied": varied}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that `get_state` returned; outputs are filled again by the next step."""
+        for field, values in state["varied"].items():
+            self.vary(field)[:] = values
+        for field in state["outputs"]:
+            self.bind(field)
+        self._batch.state[:] = state["state"]
+        self._batch.warning[:] = state["warning"]
+
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
         self._bound.add(field)

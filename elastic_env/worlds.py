@@ -75,7 +75,7 @@ class Worlds:
 
     def restart(self, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes in some worlds, a (num_worlds,) mask, each from its own generator."""
-        self._score_samples()
+        self.score_samples()
         self.simulation.restart(worlds)
         self.task.restart(self.simulation, worlds, generators)
         self._metrics.restart(worlds)
@@ -106,11 +106,11 @@ class Worlds:
         reason = _reasons(failures, self.num_worlds) if terminated.any() else self._no_reason
         info = StepInfo({"reward_terms": terms, "termination": reason}, lambda: self._signals(sample))
         if (terminated | truncated).any():
-            self._score_samples()
+            self.score_samples()
             failed = {name: mask.copy() for name, mask in failures.items()}
             info["episode_metrics"] = {**self._metrics.values(), **failed}
         elif len(self._samples) >= _SCORED_AT_ONCE:
-            self._score_samples()
+            self.score_samples()
         reward = functools.reduce(np.add, terms.values())
         return Transition(self.task.observe(), reward, terminated, truncated, info)
 
@@ -118,8 +118,8 @@ class Worlds:
         clipped = np.asarray(sample.is_clipped.any(axis=1), dtype=np.float64)
         return {**self.task.signals(sample.of_task), "clipped": clipped}
 
-    def _score_samples(self) -> None:
-        """Take into the metrics what the last steps have left."""
+    def score_samples(self) -> None:
+        """Take into the metrics what the last steps have left; when that happens makes no difference to them."""
         if not self._samples:
             return
         shape = (len(self._samples), self.num_worlds)

@@ -1,4 +1,4 @@
-"""The command `elastic`: identify, evaluate, compare, speed, play, demo."""
+"""The command `elastic`: identify, evaluate, compare, train, speed, play, demo."""
 
 import os
 import re
@@ -129,6 +129,48 @@ class Compare:
 
 
 @dataclass
+class Train:
+    """Train a residual on top of a base policy, for every training seed of a configuration.
+
+    Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train --resume runs/NAME.
+    A run keeps, for every seed, checkpoint/ to go on from, best/ and last/ as policies, which elastic evaluate and
+    compare take as residual:PATH, progress.csv, and files for TensorBoard.
+    """
+
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """Configuration; those in configs/train_*.yaml are examples."""
+    resume: Path | None = None
+    """Folder of a run to go on with."""
+    seeds: list[int] | None = None
+    """Training seeds instead of the configuration's."""
+    decisions: int | None = None
+    """Decisions of all worlds together instead of the configuration's."""
+    output: Path | None = None
+    """Folder for the run, new or empty; default runs/<name>, numbered if taken."""
+
+    def run(self) -> None:
+        """Train, or go on with it."""
+        if (self.config is None) == (self.resume is None):
+            raise ConfigurationError("name either a configuration or, with --resume, the run to go on with")
+        try:
+            from train.learn import TrainConfig
+            from train.run_training import resume, start
+        except ModuleNotFoundError as error:
+            raise ConfigurationError(
+                f"training needs {error.name}; install the extra: pip install 'elastic-env[train]'"
+            ) from None
+        if self.resume is not None:
+            folder = resume(self.resume, _CONSOLE)
+        else:
+            config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
+            with _options_named():
+                given = {"seeds": self.seeds, "decisions": self.decisions}
+                config = config.replace(**{name: value for name, value in given.items() if value is not None})
+            folder = start(config, _CONSOLE, self.output)
+        _CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
+
+
+@dataclass
 class Speed:
     """Measure throughput against raw mj_step on the same model, in one interleaved run.
 
@@ -229,6 +271,7 @@ Command = (
     Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]

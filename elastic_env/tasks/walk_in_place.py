@@ -118,6 +118,7 @@ class WalkTask:
         """Control steps of an episode."""
         self._count(np.zeros(n, dtype=np.int64))
         self._reference, self._phases = _reference_rows(self.plan), _phase_rows(self.plan)
+        self._reference.flags.writeable = self._phases.flags.writeable = False
         self._draw = np.zeros(n, dtype=np.int64)
         self._stiffness, self._damping = np.tile(self._true_model.stiffness, (n, 1)), self._true_model.damping
         self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0

@@ -1,0 +1,92 @@
+"""Several vector environments as one: worlds of different scenarios that one agent learns from."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from elastic_env.errors import ConfigurationError
+from elastic_env.signals import Array, BoolArray
+
+
+class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """The worlds of several vector environments with same-step autoreset, one environment's after the other's.
+
+    Args:
+        envs: With equal spaces, such as `ResidualVectorWrapper`s of the same settings in different scenarios.
+
+    Raises:
+        ConfigurationError: None, spaces that differ, or another autoreset mode.
+    """
+
+    def __init__(self, envs: Sequence[gymnasium.vector.VectorEnv[Any, Any, Any]]) -> None:
+        if not envs:
+            raise ConfigurationError("a mixture needs at least one environment")
+        for env in envs:
+            if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+                raise ConfigurationError("all environments of a mixture must have autoreset_mode SameStep")
+            if (env.single_observation_space, env.single_action_space) != (
+                envs[0].single_observation_space,
+                envs[0].single_action_space,
+            ):
+                raise ConfigurationError("all environments of a mixture must have the same spaces")
+        self.envs = list(envs)
+        self.num_envs = sum(env.num_envs for env in envs)
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.single_observation_space = envs[0].single_observation_space
+        self.single_action_space = envs[0].single_action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        ends = np.cumsum([env.num_envs for env in envs]).tolist()
+        self._worlds = [slice(end - env.num_envs, end) for env, end in zip(envs, ends, strict=True)]
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every world; world i gets seed + i, or the i-th of a list of seeds."""
+        seeds: Any = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+        observations = []
+        for env, worlds in zip(self.envs, self._worlds, strict=True):
+            own: Any = None if seeds is None else list(seeds[worlds])
+            observations.append(env.reset(seed=own, options=options)[0])
+        return np.concatenate(observations), {}
+
+    def spread(self, observation: Array, generator: np.random.Generator) -> Array:
+        """Spread the worlds of every environment over the episode, see `ResidualVectorWrapper.spread`."""
+        parts = [
+            env.spread(observation[worlds], generator)  # type: ignore[attr-defined]
+            for env, worlds in zip(self.envs, self._worlds, strict=True)
+        ]
+        return np.concatenate(parts)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One step in every world; the infos are those of worlds that end."""
+        results = [env.step(actions[worlds]) for env, worlds in zip(self.envs, self._worlds, strict=True)]
+        observation, reward, terminated, truncated = (
+            np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
+        )
+        return observation, reward, terminated, truncated, self._info([result[4] for result in results])
+
+    def close(self, **kwargs: Any) -> None:
+        """Close all environments."""
+        for env in self.envs:
+            env.close(**kwargs)
+
+    def _info(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
+        ended = [
+            info.get("_final_info", np.zeros(env.num_envs, bool)) for info, env in zip(infos, self.envs, strict=True)
+        ]
+        mask: BoolArray = np.concatenate(ended)
+        if not mask.any():
+            return {}
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        metrics: dict[str, Array] = {}
+        for info, worlds, some in zip(infos, self._worlds, ended, strict=True):
+            if some.any():
+                final_obs[worlds] = info["final_obs"]
+                for name, values in info["final_info"]["episode_metrics"].items():
+                    whole = metrics.setdefault(name, np.zeros(self.num_envs, dtype=np.asarray(values).dtype))
+                    whole[worlds] = values
+        final_info = {"episode_metrics": metrics, "_episode_metrics": mask}
+        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask}

@@ -1,0 +1,156 @@
+"""State of environments, policies and random generators as arrays and plain values, for checkpoints.
+
+The state of an object of ours is that of its attributes: arrays that can be written to, random generators, plain
+values, records of rows, and containers and objects of these. What cannot change is left out: read-only arrays, frozen
+models, compiled physics models, functions. Nothing is pickled: a checkpoint is arrays and JSON.
+"""
+
+import json
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from elastic_env.config import Model
+from elastic_env.errors import ElasticError
+from elastic_env.rows import Rows
+from elastic_env.signals import Array
+from elastic_env.simulation import ManyWorlds
+from elastic_env.worlds import Worlds
+
+_OURS = ("elastic_env", "baselines", "train")
+_PLAIN = (bool, int, float, str, type(None))
+_ARRAY, _TUPLE, _ROWS, _GENERATOR = "array", "tuple", "rows", "generator"
+
+
+def capture(value: Any) -> Any:
+    """The state of something, as nested dictionaries and lists of arrays and plain values."""
+    return _Captured().of(value)
+
+
+def restore(value: Any, state: Any) -> Any:
+    """Bring something that is built alike back into a captured state.
+
+    Args:
+        value: What to change; objects and generators are changed in place.
+        state: What `capture` returned for it, or for its like.
+
+    Returns:
+        The value to keep: the same object, or a new one for what cannot be changed in place.
+
+    Raises:
+        ElasticError: The state is of something else.
+    """
+    if isinstance(state, dict) and _GENERATOR in state:
+        value.bit_generator.state = state[_GENERATOR]
+        return value
+    if isinstance(state, dict) and _ROWS in state:
+        return type(value)(*(restore(getattr(value, name), part) for name, part in state[_ROWS].items()))
+    if isinstance(state, dict) and "worlds" in state and isinstance(value, ManyWorlds):
+        value.set_state(state["worlds"])
+        return value
+    if isinstance(state, dict) and "object" in state:
+        if type(value).__name__ != state["object"]:
+            raise ElasticError(f"a checkpoint of {state['object']} cannot be restored into {type(value).__name__}")
+        for name, part in state["attributes"].items():
+            setattr(value, name, restore(getattr(value, name), part))
+        return value
+    if isinstance(state, dict) and _TUPLE in state:
+        parts = state[_TUPLE]
+        old = value if isinstance(value, tuple) and len(value) == len(parts) else [None] * len(parts)
+        return tuple(restore(mine, part) for mine, part in zip(old, parts, strict=True))
+    if isinstance(state, dict):
+        return {name: restore(_get(value, name), part) for name, part in state["dict"].items()}
+    if isinstance(state, list):
+        old = value if isinstance(value, list) and len(value) == len(state) else [None] * len(state)
+        return [restore(mine, part) for mine, part in zip(old, state, strict=True)]
+    if isinstance(state, np.ndarray):
+        return state.copy()  # not in place: what was one array may have become two
+    return state
+
+
+def _get(value: Any, name: str) -> Any:
+    return value.get(name) if isinstance(value, Mapping) else None
+
+
+class _Captured:
+    """Walks over objects, each once."""
+
+    def __init__(self) -> None:
+        self._seen: set[int] = set()
+
+    def of(self, value: Any) -> Any:
+        """State of a value; None where there is none."""
+        if isinstance(value, _PLAIN):
+            return value
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, np.ndarray):
+            return value.copy()
+        if isinstance(value, np.random.Generator):
+            return {_GENERATOR: value.bit_generator.state}
+        if isinstance(value, Rows):
+            return {_ROWS: {name: self.of(getattr(value, name)) for name in value._names()}}
+        if isinstance(value, tuple):
+            return {_TUPLE: [self.of(part) for part in value]}
+        if isinstance(value, list | deque):
+            return [self.of(part) for part in value]
+        if isinstance(value, dict):
+            return {"dict": {name: self.of(part) for name, part in value.items()}}
+        if isinstance(value, ManyWorlds):
+            return {"worlds": value.get_state()}
+        self._seen.add(id(value))
+        if isinstance(value, Worlds):
+            value.score_samples()
+        attributes = {name: part for name, part in vars(value).items() if self._changes(part)}
+        return {
+            "object": type(value).__name__,
+            "attributes": {name: self.of(part) for name, part in attributes.items()},
+        }
+
+    def _changes(self, value: Any) -> bool:
+        """Whether an attribute has state that can change."""
+        if isinstance(value, (*_PLAIN, np.generic, np.random.Generator, Rows, ManyWorlds)):
+            return True
+        if isinstance(value, np.ndarray):
+            return value.flags.writeable and value.dtype != object
+        if isinstance(value, tuple | list | deque):
+            return all(self._changes(part) for part in value)
+        if isinstance(value, dict):
+            return all(isinstance(name, str) and self._changes(part) for name, part in value.items())
+        module = type(value).__module__.split(".")[0]
+        frozen = isinstance(value, Model) or getattr(type(value), "__dataclass_params__", None) is not None
+        return module in _OURS and not frozen and hasattr(value, "__dict__") and id(value) not in self._seen
+
+
+def write_state(folder: Path, name: str, state: Any) -> None:
+    """Write a captured state as `name.npz` and `name.json`."""
+    arrays: dict[str, Array] = {}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            arrays[key := f"a{len(arrays)}"] = value
+            return {_ARRAY: key}
+        if isinstance(value, dict):
+            return {name: plain(part) for name, part in value.items()}
+        return [plain(part) for part in value] if isinstance(value, list) else value
+
+    text = json.dumps(plain(state))
+    np.savez(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
+    (folder / f"{name}.json").write_text(text)
+
+
+def read_state(folder: Path, name: str) -> Any:
+    """A state that `write_state` wrote; runs no code from the files."""
+    with np.load(folder / f"{name}.npz", allow_pickle=False) as arrays:
+
+        def whole(value: Any) -> Any:
+            if isinstance(value, dict):
+                return (
+                    arrays[value[_ARRAY]] if set(value) == {_ARRAY} else {k: whole(part) for k, part in value.items()}
+                )
+            return [whole(part) for part in value] if isinstance(value, list) else value
+
+        return whole(json.loads((folder / f"{name}.json").read_text()))
