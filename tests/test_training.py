@@ -1,0 +1,244 @@
+"""Training of residuals: resumed against uninterrupted to the last bit, states, mixtures, and what is refused."""
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+from gymnasium.vector import AutoresetMode
+
+from baselines.residual import load_residual
+from elastic_env.errors import ConfigurationError, ElasticError
+from elastic_env.signals import Array
+from train.cli import main
+from train.learn import TrainConfig, Training, read_progress
+from train.mixed_env import MixedVectorEnv
+from train.residual_env import ResidualVectorWrapper
+from train.sb3_env import SB3VecEnv
+from train.state import capture, read_state, restore, write_state
+
+ROOT = Path(__file__).parents[1]
+SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
+SMALL: dict[str, Any] = {
+    "env": "testbed", "reference": SINE, "base": "input", "worlds": 4, "decisions": 192, "evaluate_every": 96,
+    "checkpoint_every": 32, "evaluation_episodes": 1, "settings": {"decision_period": 10, "history": 1},
+}  # fmt: skip
+PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}}
+SAC = {"algorithm": "SAC", "algorithm_options": {"learning_starts": 32, "batch_size": 16, "gradient_steps": 1}}
+
+
+def wrapped(
+    robot: str = "testbed", n: int = 3, scenario: str = "nominal", base: str = "input"
+) -> ResidualVectorWrapper:
+    """Residuals of a few worlds."""
+    name = "elastic_env/Testbed-v0" if robot == "testbed" else "elastic_env/WalkInPlace-v0"
+    motion = {"reference": SINE} if robot == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
+    env = gymnasium.make_vec(
+        name, num_envs=n, vectorization_mode="vector_entry_point", autoreset_mode=AutoresetMode.SAME_STEP,
+        scenario=scenario, **motion,
+    )  # fmt: skip
+    return ResidualVectorWrapper(env, base, history=1, decision_period=10)
+
+
+def weights(folder: Path) -> dict[str, Array]:
+    """Tensors of a residual."""
+    from safetensors.numpy import load_file
+
+    return load_file(folder / "weights.safetensors")
+
+
+@pytest.mark.parametrize("options", [PPO, SAC], ids=["PPO", "SAC"])
+def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Catches a random state, a world, a memory, an optimiser or a buffer that does not go on where it was."""
+    whole = TrainConfig(**{**SMALL, **options})
+    Training(whole, 1, tmp_path / "whole").run()
+    part = whole.replace(decisions=96)
+    Training(part, 1, tmp_path / "part").run()
+    for name in ("last", "best"):
+        shutil.rmtree(tmp_path / "part" / name)
+    resumed = Training(whole, 1, tmp_path / "part")
+    assert 0 < resumed.done < whole.decisions
+    resumed.run()
+    one, other = weights(tmp_path / "whole" / "last"), weights(tmp_path / "part" / "last")
+    assert one.keys() == other.keys()
+    for name, tensor in one.items():
+        np.testing.assert_array_equal(tensor, other[name], err_msg=name)
+    assert (tmp_path / "whole" / "progress.csv").read_text().splitlines()[-1] == (
+        (tmp_path / "part" / "progress.csv").read_text().splitlines()[-1]
+    )
+
+
+def test_a_killed_training_goes_on(tmp_path: Path) -> None:
+    """Catches a checkpoint that is half written, and a kill that loses or repeats an evaluation."""
+    code = (
+        "from pathlib import Path; import sys; from tests.test_training import SMALL, PPO;"
+        "from train.learn import TrainConfig, Training;"
+        "Training(TrainConfig(**{**SMALL, **PPO}), 1, Path(sys.argv[1])).run()"
+    )
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    process = subprocess.Popen([sys.executable, "-c", code, str(killed)], cwd=ROOT)
+    while not (killed / "checkpoint").exists():
+        time.sleep(0.02)
+        assert process.poll() is None
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    for folder in (killed, whole):
+        Training(TrainConfig(**{**SMALL, **PPO}), 1, folder).run()
+    for name, tensor in weights(whole / "last").items():
+        np.testing.assert_array_equal(tensor, weights(killed / "last")[name], err_msg=name)
+    assert read_progress(killed) == read_progress(whole)
+
+
+@pytest.mark.parametrize("robot", ["testbed", "walker"])
+def test_worlds_go_on_from_a_state_in_files(robot: str, tmp_path: Path) -> None:
+    """Catches a part of the worlds that is not in the state, or that two worlds share after it is restored."""
+    base = "input" if robot == "testbed" else "dynamic"
+
+    def made() -> SB3VecEnv:
+        mixture = [wrapped(robot, 2, scenario, base) for scenario in ("sensor", "nominal")]
+        return SB3VecEnv(MixedVectorEnv(mixture), np.random.default_rng(0))
+
+    generator = np.random.default_rng(1)
+    one, other = made(), made()
+    one.seed(5)
+    one.reset()
+    joints = one.action_space.shape[0]  # type: ignore[index]
+    for _ in range(5):
+        one.step(generator.uniform(-1.0, 1.0, (4, joints)))
+    write_state(tmp_path, "worlds", capture(one))
+    restore(other, read_state(tmp_path, "worlds"))
+    ends = 0
+    for _ in range(100):
+        residual = generator.uniform(-1.0, 1.0, (4, joints))
+        for mine, same in zip(one.step(residual), other.step(residual), strict=True):
+            if isinstance(mine, list):
+                ends += sum(bool(info) for info in mine)
+                np.testing.assert_equal(mine, same)
+            else:
+                np.testing.assert_array_equal(mine, same)
+    assert ends >= 4
+
+
+def test_a_state_of_something_else_is_refused() -> None:
+    """Catches a checkpoint of one robot that is loaded into another."""
+    with pytest.raises(ElasticError, match=r"checkpoint of TestbedTask cannot be restored into WalkTask"):
+        restore(wrapped("walker", 2, base="input_output"), capture(wrapped("testbed", 2)))
+
+
+def test_a_mixture_is_its_parts() -> None:
+    """Catches worlds that get another's action, seed or end."""
+    parts = [wrapped(n=2), wrapped(n=1, scenario="soft")]
+    whole = MixedVectorEnv([wrapped(n=2), wrapped(n=1, scenario="soft")])
+    observation, _ = whole.reset(seed=7)
+    alone = np.concatenate([parts[0].reset(seed=7)[0], parts[1].reset(seed=9)[0]])
+    np.testing.assert_array_equal(observation, alone)
+    generator, ends = np.random.default_rng(2), 0
+    for _ in range(100):
+        residual = generator.uniform(-1.0, 1.0, (3, 1))
+        observation, reward, terminated, truncated, info = whole.step(residual)
+        results = [parts[0].step(residual[:2]), parts[1].step(residual[2:])]
+        for i, mine in enumerate((observation, reward, terminated, truncated)):
+            np.testing.assert_array_equal(mine, np.concatenate([result[i] for result in results]))
+        if truncated.any():
+            ends += 1
+            for world, (part, row) in enumerate([(0, 0), (0, 1), (1, 0)]):
+                if truncated[world]:
+                    final = results[part][4]
+                    np.testing.assert_array_equal(info["final_obs"][world], final["final_obs"][row])
+                    metrics = final["final_info"]["episode_metrics"]["link_error_rms_rad"]
+                    assert info["final_info"]["episode_metrics"]["link_error_rms_rad"][world] == metrics[row]
+    assert ends > 0
+
+
+def test_spread_worlds_stand_all_over_the_walk() -> None:
+    """Catches worlds that begin together, so that every batch shows one phase."""
+    env = wrapped("walker", 6, base="input_output")
+    features, _ = env.reset(seed=0)
+    spread = env.spread(features, np.random.default_rng(0))
+    clock = env.unwrapped.task.observation_table.names.index("clock.time")  # type: ignore[attr-defined]
+    times = np.sort(spread[:, clock])
+    length = env.unwrapped.task.num_steps * 0.004  # type: ignore[attr-defined]
+    assert np.diff(times).min() > 0.08 * length
+    assert times[-1] - times[0] > 0.6 * length
+
+
+def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches a policy that is scored on episodes that it learned from."""
+    seen: dict[str, list[Any]] = {"training": []}
+    reset = MixedVectorEnv.reset
+
+    def spied(self: MixedVectorEnv, *, seed: Any = None, options: Any = None) -> Any:
+        seen["training"].append(seed)
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(MixedVectorEnv, "reset", spied)
+    config = TrainConfig(**{**SMALL, **PPO, "decisions": 32})
+    for seed in (0, 1):
+        Training(config, seed, tmp_path / str(seed)).run()
+    trained = {one for seeds in seen["training"] if seeds is not None for one in seeds}
+    assert len(trained) == 8
+    evaluated = config.condition("nominal", "input")
+    assert max(range(evaluated.seed, evaluated.seed + 1_000)) < min(trained)
+
+
+def test_train_command_trains_every_seed_and_resumes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches a seed that is left out, policies that nothing can play, and a resume that begins anew."""
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text(yaml.safe_dump({"name": "mine", **SMALL, **PPO, "seeds": [3, 4]}))
+    main(["train", "c.yaml", "--decisions", "64"])
+    assert "elastic train --resume runs/mine" in capsys.readouterr().out
+    for seed in (3, 4):
+        description, _ = load_residual(Path(f"runs/mine/seed_{seed}/last"))
+        assert description.training["seed"] == seed
+        assert {row["scenario"] for row in read_progress(Path(f"runs/mine/seed_{seed}"))} == {"nominal"}
+    before = (Path("runs/mine/seed_3/last/weights.safetensors")).read_bytes()
+    main(["train", "--resume", "runs/mine"])
+    assert Path("runs/mine/seed_3/last/weights.safetensors").read_bytes() == before
+    main(["evaluate", "--policy", "residual:runs/mine/seed_3/last", "--reference", "sine", "--output", "e"])
+    with Path("e/episodes.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["link_error_rms_rad"]) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algorithm": "PPOO"}, "'PPOO'.*SAC"),
+        ({"algorithm": "nowhere:Class"}, "nowhere"),
+        ({"worlds": 3, "scenarios": ["nominal", "soft"]}, "two per scenario, 4, got 3"),
+        ({"base": "inptu"}, "'inptu'.*input"),
+        ({"scenarios": ["sotf"]}, "'sotf'.*soft"),
+        ({"base": "zero"}, "compensates none; use space 'joint'"),
+    ],
+)
+def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    """Catches a traceback, or hours of training of something else."""
+    with pytest.raises(ConfigurationError, match=message):
+        Training(TrainConfig(**{**SMALL, **PPO, **changes}), 0, tmp_path / "x")
+
+
+def test_the_right_model_is_rewarded() -> None:
+    """Catches a reward of the wrong sign, and a residual that does not arrive."""
+    env = wrapped(n=2, scenario="ideal", base="dynamic")
+    rewards = []
+    for residual in (-0.5, 0.0, 0.5):
+        env.reset(seed=0)
+        total = 0.0
+        for _ in range(50):
+            _, reward, _, _, _ = env.step(np.full((2, 1), residual))
+            total += float(reward.sum())
+        rewards.append(total)
+    assert rewards[1] > max(rewards[0], rewards[2])  # the model is right
