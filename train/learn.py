@@ -127,6 +127,7 @@ class Training:
         self._shrink_last_layer()
         self.model.action_space.seed(seed)
         self.best = np.inf
+        self._base_scores: dict[str, tuple[float, int]] = {}
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
             self._resume()
@@ -280,7 +281,8 @@ class Training:
     def _wrapped(self, scenario: str, worlds: int) -> ResidualVectorWrapper:
         config = self.config
         condition = config.condition(scenario, config.base)
-        env = make_vector_env(condition, worlds, 0, AutoresetMode.SAME_STEP)
+        threads = 1 if len(config.scenarios) > 1 else 0  # scenarios step side by side
+        env = make_vector_env(condition, worlds, threads, AutoresetMode.SAME_STEP)
         base = baselines.make(config.base, env, **config.base_options)
         settings = config.settings.model_dump()
         return ResidualVectorWrapper(env, base, **settings)
@@ -330,12 +332,12 @@ class Training:
         current = self._export("current")
         table, primary = [], environment(self.config.env).overview.metric
         for scenario in self.config.scenarios:
-            scores = []
-            for policy in (f"residual:{current}", self.config.base):
-                result = evaluate(self.config.condition(scenario, policy))
-                values = result.values(primary)
-                scores.append((float(np.mean(values)) if len(values) else np.nan, result.num_failed))
-            (mine, falls), (base, base_falls) = scores
+            if scenario not in self._base_scores:
+                self._base_scores[scenario] = self._score(scenario, self.config.base, primary)
+            (mine, falls), (base, base_falls) = (
+                self._score(scenario, f"residual:{current}", primary),
+                self._base_scores[scenario],
+            )
             table.append([self.done, scenario, mine, base, falls, base_falls])
         _append(
             self.folder / "progress.csv",
@@ -351,6 +353,12 @@ class Training:
         torch.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
+
+    def _score(self, scenario: str, policy: str, metric: str) -> tuple[float, int]:
+        """Mean of a metric over the episodes that did not fail, and how many did."""
+        result = evaluate(self.config.condition(scenario, policy))
+        values = result.values(metric)
+        return (float(np.mean(values)) if len(values) else np.nan), result.num_failed
 
 
 def _shares(config: TrainConfig) -> list[tuple[str, int]]:

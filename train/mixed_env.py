@@ -1,6 +1,8 @@
 """Several vector environments as one: worlds of different scenarios that one agent learns from."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
@@ -15,14 +17,18 @@ from elastic_env.signals import Array, BoolArray
 class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """The worlds of several vector environments with same-step autoreset, one environment's after the other's.
 
+    They step side by side on threads: while the physics of one runs without Python, another's policy runs in it. Give
+    each one thread of physics then; the results do not depend on it.
+
     Args:
         envs: With equal spaces, such as `ResidualVectorWrapper`s of the same settings in different scenarios.
+        num_threads: Environments that step at a time, 0 for as many as there are cores.
 
     Raises:
         ConfigurationError: None, spaces that differ, or another autoreset mode.
     """
 
-    def __init__(self, envs: Sequence[gymnasium.vector.VectorEnv[Any, Any, Any]]) -> None:
+    def __init__(self, envs: Sequence[gymnasium.vector.VectorEnv[Any, Any, Any]], num_threads: int = 0) -> None:
         if not envs:
             raise ConfigurationError("a mixture needs at least one environment")
         for env in envs:
@@ -34,6 +40,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             ):
                 raise ConfigurationError("all environments of a mixture must have the same spaces")
         self.envs = list(envs)
+        self._threads = ThreadPoolExecutor(min(num_threads or os.cpu_count() or 1, len(envs)))
         self.num_envs = sum(env.num_envs for env in envs)
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.single_observation_space = envs[0].single_observation_space
@@ -54,15 +61,15 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def spread(self, observation: Array, generator: np.random.Generator) -> Array:
         """Spread the worlds of every environment over the episode, see `ResidualVectorWrapper.spread`."""
-        parts = [
-            env.spread(observation[worlds], generator)  # type: ignore[attr-defined]
-            for env, worlds in zip(self.envs, self._worlds, strict=True)
-        ]
-        return np.concatenate(parts)
+        own = generator.spawn(len(self.envs))
+        parts = [observation[worlds] for worlds in self._worlds]
+        spread: Any = self._threads.map(lambda env, part, mine: env.spread(part, mine), self.envs, parts, own)
+        return np.concatenate(list(spread))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One step in every world; the infos are those of worlds that end."""
-        results = [env.step(actions[worlds]) for env, worlds in zip(self.envs, self._worlds, strict=True)]
+        parts = [actions[worlds] for worlds in self._worlds]
+        results = list(self._threads.map(lambda env, part: env.step(part), self.envs, parts))
         observation, reward, terminated, truncated = (
             np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
         )
@@ -70,6 +77,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def close(self, **kwargs: Any) -> None:
         """Close all environments."""
+        self._threads.shutdown()
         for env in self.envs:
             env.close(**kwargs)
 
