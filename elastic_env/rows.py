@@ -12,6 +12,8 @@ from elastic_env.signals import BoolArray
 class Rows:
     """Base of frozen dataclasses whose fields are arrays with one row per world, or such records themselves."""
 
+    __slots__ = ()
+
     def with_worlds(self, worlds: BoolArray, other: Self) -> Self:
         """These values with those of another in some worlds, a (num_worlds,) mask."""
 

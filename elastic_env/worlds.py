@@ -20,7 +20,7 @@ DIVERGED = "diverged"
 """Reason of termination where the simulation produced a bad number; MuJoCo alone would restart it silently."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Transition:
     """Result of a control step, one row per world."""
 
@@ -40,7 +40,7 @@ _SCORED_AT_ONCE = 16
 """Control steps whose signals are computed together."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _Sample(Rows):
     """What the scores of a step need: the task's sample, which actions were out of bounds, and where it diverged."""
 

@@ -1,4 +1,4 @@
-"""The command `elastic`: identify, evaluate, compare, train, speed, play, demo."""
+"""The command `elastic`: identify, evaluate, compare, train, bench, speed, play, demo."""
 
 import os
 import re
@@ -171,6 +171,29 @@ class Train:
 
 
 @dataclass
+class Bench:
+    """Guard figures in CI: short rollouts of both environments against what was accepted.
+
+    Exit code 1, and a line for every figure that falls short. Appends its table to the file that $GITHUB_STEP_SUMMARY
+    names. Example, to accept new figures: elastic bench --update
+    """
+
+    config: Annotated[Path, tyro.conf.Positional] = Path("configs/bench.yaml")
+    """Configuration with rollouts and accepted figures."""
+    update: bool = False
+    """Accept what is measured now, and write the configuration anew."""
+    output: Path | None = None
+    """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
+
+    def run(self) -> None:
+        """Play and compare."""
+        from train.bench import bench
+
+        if not bench(self.config, _CONSOLE, self.update, self.output):
+            sys.exit(1)
+
+
+@dataclass
 class Speed:
     """Measure throughput against raw mj_step on the same model, in one interleaved run.
 
@@ -272,6 +295,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]

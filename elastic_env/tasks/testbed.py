@@ -77,7 +77,7 @@ class TestbedTruth:
     model: RobotModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TestbedSample(Rows):
     """What a step is scored by, (n,) each; names as in the signals that are made of it."""
 
@@ -280,7 +280,7 @@ class TestbedTask:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _Measurement(Rows):
     """Sensor values, (num_worlds,) each [rad]; the encoder also a control period earlier."""
 

@@ -38,7 +38,7 @@ class WalkTruth:
     model: WalkerModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class WalkState(Rows):
     """The true state, n rows.
 
@@ -79,7 +79,7 @@ class WalkState(Rows):
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class WalkMeasurement(Rows):
     """Sensor values, n rows.
 
@@ -99,7 +99,7 @@ class WalkMeasurement(Rows):
         return cls(encoder, before, np.zeros((n, WRENCH.stop)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class WalkSample(Rows):
     """What a step is scored by, n rows.
 

@@ -1,0 +1,83 @@
+"""The CI benchmark: what it measures, how it fails, what it writes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from train.bench import BenchConfig
+from train.cli import main
+
+ROOT = Path(__file__).parents[1]
+QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results of a test go to its own folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
+
+
+def written(**case: Any) -> Path:
+    """A configuration of one rollout."""
+    path = Path("bench.yaml")
+    content = {"env": "testbed", "policy": "input", "reference": QUICK, "figures": {"link_error_rms_rad": None}, **case}
+    path.write_text(yaml.safe_dump({"cases": [content]}))
+    return path
+
+
+def failed(arguments: list[str]) -> bool:
+    """Whether the command ends with exit code 1."""
+    code = 0
+    try:
+        main(["bench", *arguments])
+    except SystemExit as end:
+        code = end.code
+    assert code in (0, 1)
+    return code == 1
+
+
+def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a margin with the wrong sign, an update that accepts something else, and a failure without exit code."""
+    path = written()
+    assert failed([str(path)])
+    assert "nothing was accepted yet; elastic bench --update" in capsys.readouterr().out
+    assert not failed([str(path), "--update"])
+    accepted = yaml.safe_load(path.read_text())["cases"][0]["figures"]["link_error_rms_rad"]
+    assert path.read_text().startswith("# What `elastic bench` guards")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
+    assert not failed([str(path)])
+    (figure,) = json.loads(Path("runs/bench-3/bench.json").read_text())
+    assert figure["measured"] == pytest.approx(accepted, rel=1e-3)
+    assert figure["bound"] == pytest.approx(1.05 * accepted)
+    written(figures={"link_error_rms_rad": accepted / 1.1})
+    capsys.readouterr()
+    assert failed([str(path)])
+    assert f"link_error_rms_rad is {accepted:.4g}, at most" in capsys.readouterr().out
+    assert Path("summary.md").read_text().count("## elastic bench") == 2
+    assert "falls short" in Path("summary.md").read_text()
+
+
+def test_a_fall_and_an_unknown_figure_fall_short(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches nan that counts as small, and a misspelt metric that guards nothing."""
+    walk = {"step_period": [0.3, 0.4, 0.3], "num_steps": 2}
+    path = written(
+        env="walker", policy="zero", scenario="ideal+soft", reference=walk, figures={"pelvis_roll_rms_rad": 9.0}
+    )
+    assert failed([str(path)])
+    assert "the episode ended as 'fell'" in capsys.readouterr().out
+    path = written(figures={"link_eror_rms_rad": 9.0})
+    assert failed([str(path)])
+    assert "is no metric of this episode; those are" in capsys.readouterr().out
+
+
+def test_the_shipped_configuration_is_accepted_in_full() -> None:
+    """Catches a rollout that nobody has measured, and one without a walk."""
+    config = BenchConfig.model_validate(yaml.safe_load((ROOT / "configs" / "bench.yaml").read_text()))
+    assert all(value is not None for case in config.cases for value in case.figures.values())
+    assert {case.env for case in config.cases} == {"testbed", "walker"}

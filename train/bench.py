@@ -1,0 +1,189 @@
+"""`elastic bench`: short rollouts whose figures a CI guards; seconds long, without torch."""
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import Field
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from elastic_env.config import Model, load_yaml, quantity
+from train.conditions import Condition, Motion, PolicySpec
+from train.environments import environment
+from train.evaluate import Evaluation
+from train.runs import run_folder
+from train.workers import run_conditions
+
+_HEADER = """\
+# What `elastic bench` guards: figures of short rollouts, each accepted up to the margin above it, and no falls.
+# `elastic bench --update` writes the figures anew.
+"""
+
+
+class BenchCase(Model):
+    """A short rollout and the figures that it must keep."""
+
+    env: str
+    policy: str
+    """A baseline, residual:PATH, or "module:function"."""
+    scenario: str = "nominal"
+    reference: Motion = None
+    """Motion, as in a comparison; None for the environment's default."""
+    seed: int = 0
+    figures: dict[str, float | None] = Field(min_length=1)
+    """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""
+
+    @property
+    def condition(self) -> Condition:
+        """The cell to play."""
+        motion = environment(self.env).default_reference if self.reference is None else self.reference
+        policy = PolicySpec(name=self.policy)
+        return Condition(env=self.env, policy=policy, scenario=self.scenario, seed=self.seed, reference=motion)
+
+
+class BenchConfig(Model):
+    """The rollouts of `elastic bench`."""
+
+    name: str = "bench"
+    margin: float = quantity("1", 0.05, ge=0, description="relative amount by which a figure may exceed the accepted")
+    cases: list[BenchCase] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of a rollout against what was accepted.
+
+    Attributes:
+        case: Environment, motion, scenario and policy.
+        metric: Its name, which ends with its unit.
+        measured: nan where the episode failed or does not have it.
+        accepted: None where nothing was accepted yet.
+        bound: What it may be at most.
+        problem: Why it falls short, in words; empty where it does not.
+    """
+
+    case: str
+    metric: str
+    measured: float
+    accepted: float | None
+    bound: float | None
+    problem: str
+
+
+def bench(path: Path, console: Console, update: bool = False, output: Path | None = None) -> bool:
+    """Play the rollouts of a configuration, write and print their figures.
+
+    Args:
+        path: Configuration; with `update` it is written anew.
+        console: Where progress and results go.
+        update: Accept what is measured now.
+        output: Folder for bench.json and bench.md; default runs/bench, numbered if taken.
+
+    Returns:
+        Whether all figures kept their bounds.
+
+    Raises:
+        ConfigurationError: Names or options that do not exist.
+        ResultsExistError: The output folder holds results.
+    """
+    config = load_yaml(path, BenchConfig)
+    with run_folder(config.name, config.model_dump(mode="json"), None, output) as folder:
+        evaluations = run_conditions([case.condition for case in config.cases], console)
+        figures = [
+            figure
+            for case, evaluation in zip(config.cases, evaluations, strict=True)
+            for figure in _figures(case, evaluation, config.margin)
+        ]
+        (folder / "bench.json").write_text(json.dumps([_plain(figure) for figure in figures], indent=2) + "\n")
+        markdown = _markdown(figures)
+        (folder / "bench.md").write_text(markdown)
+    summary = os.environ.get("GITHUB_STEP_SUMMARY")
+    if summary:
+        with Path(summary).open("a", encoding="utf-8") as file:
+            file.write(markdown)
+    console.print(_table(figures))
+    console.print(f"wrote {folder}/bench.json and bench.md", soft_wrap=True)
+    if update:
+        _accept(path, config, evaluations)
+        console.print(f"accepted the figures into {path}", soft_wrap=True)
+        return all(np.isfinite(figure.measured) for figure in figures)
+    for figure in figures:
+        if figure.problem:
+            console.print(f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False)
+    return not any(figure.problem for figure in figures)
+
+
+def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[Figure]:
+    (episode,) = evaluation.episodes
+    name = f"{case.env}, {evaluation.condition.reference_name}, {case.scenario}, {case.policy}"
+    found = []
+    for metric, accepted in case.figures.items():
+        measured = float(episode.get(metric, np.nan)) if not episode["termination"] else float("nan")
+        bound = None if accepted is None else accepted * (1.0 + margin)
+        found.append(Figure(name, metric, measured, accepted, bound, _problem(metric, measured, bound, episode)))
+    return found
+
+
+def _problem(metric: str, measured: float, bound: float | None, episode: dict[str, Any]) -> str:
+    if episode["termination"]:
+        return f"{metric} has no value: the episode ended as {episode['termination']!r}"
+    if metric not in episode:
+        known = ", ".join(name for name in episode if name.endswith(("_m", "_rad", "_s", "_nm")))
+        return f"{metric} is no metric of this episode; those are {known}"
+    if bound is None:
+        return f"{metric} is {measured:.4g}, and nothing was accepted yet; elastic bench --update accepts it"
+    return f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted" if not measured <= bound else ""
+
+
+def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> None:
+    content = config.model_dump(mode="json", exclude_defaults=True)
+    for case, evaluation in zip(content["cases"], evaluations, strict=True):
+        (episode,) = evaluation.episodes
+        if not episode["termination"]:
+            known = [metric for metric in case["figures"] if metric in episode]
+            case["figures"] = {metric: float(f"{episode[metric]:.4g}") for metric in known}
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    path.write_text(_HEADER + text, encoding="utf-8")
+
+
+def _plain(figure: Figure) -> dict[str, Any]:
+    return {name: None if value != value else value for name, value in asdict(figure).items()}  # nan is not JSON
+
+
+def _rows(figures: list[Figure]) -> list[tuple[str, ...]]:
+    def text(value: float | None) -> str:
+        return "-" if value is None or np.isnan(value) else f"{value:.4g}"
+
+    def verdict(figure: Figure) -> str:
+        if not figure.problem:
+            return "kept"
+        return "new" if figure.bound is None and np.isfinite(figure.measured) else "falls short"
+
+    return [(f.case, f.metric, text(f.measured), text(f.accepted), text(f.bound), verdict(f)) for f in figures]
+
+
+_COLUMNS = ("rollout", "figure", "measured", "accepted", "at most", "")
+
+
+def _table(figures: list[Figure]) -> Table:
+    table = Table(title="short rollouts against what was accepted", box=box.SIMPLE)
+    for name in ("rollout and figure", "measured", "at most", ""):
+        table.add_column(name, justify="right" if name in ("measured", "at most") else "left")
+    last = ""
+    for case, metric, measured, _, bound, verdict in _rows(figures):
+        if case != last:
+            table.add_row(case, "", "", "")
+        table.add_row(f"  {metric}", measured, bound, verdict)
+        last = case
+    return table
+
+
+def _markdown(figures: list[Figure]) -> str:
+    lines = ["## elastic bench", "", "| " + " | ".join(_COLUMNS) + " |", "|---|---|---:|---:|---:|---|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in _rows(figures))]) + "\n"
