@@ -59,8 +59,12 @@ def test_nobody_draws_from_global_randomness(file: Path) -> None:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and ast.unparse(node.func).startswith(("np.random.", "numpy.random."))
     ]
-    assert [call for call in calls if call.split(".")[-1] not in ("default_rng", "Generator", "SeedSequence")] == []
-    assert "random" not in top_level(file)
+    allowed = {"default_rng", "Generator", "SeedSequence"}
+    if file == ROOT / "train" / "learn.py":  # its checkpoints hold the generators that SB3 draws from
+        allowed |= {"get_state", "set_state"}
+    else:
+        assert "random" not in top_level(file)
+    assert [call for call in calls if call.split(".")[-1] not in allowed] == []
 
 
 LAYERS = [

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from gymnasium.vector import AutoresetMode
 from PIL import Image
 from rich.console import Console
 
@@ -26,6 +27,8 @@ from train.conditions import Condition, PolicySpec
 from train.contenders import RawWorlds, VectorLoop
 from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
+from train.learn import TrainConfig
+from train.residual_env import ResidualVectorWrapper
 from train.summary import failure_notes, print_summary, summary_table, write_summary
 from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.sweep_plots import draw_sweep
@@ -35,6 +38,8 @@ SHORT = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
 TWO_STEPS = {"step_period": [0.3, 0.5, 0.3], "num_steps": 2}
 COMMAND_SHORT = "{step_period: [0.3, 0.5, 0.3], num_steps: 1}"
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+TRAININGS = [path for path in CONFIGS if path.stem.startswith("train_")]
+COMPARISONS = [path for path in CONFIGS if path not in TRAININGS and path.stem != "bench"]
 HIP_ROLL = 1
 """Place of the hip roll joint in a leg of six."""
 
@@ -362,7 +367,19 @@ def test_references_are_swept_by_their_step_period() -> None:
 # Configurations and commands.
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", TRAININGS, ids=lambda path: path.stem)
+def test_trainings_that_come_with_it_are_valid(path: Path) -> None:
+    """Catches a scenario, a base or a setting that does not exist, and a scenario that is to be held out."""
+    config = load_yaml(path, TrainConfig)
+    assert config.name == path.stem
+    assert not {"stiff", "push", "slope"} & set(config.scenarios)
+    assert len(config.seeds) >= 5
+    for scenario in config.scenarios:
+        env = make_vector_env(config.condition(scenario, config.base), 2, 1, AutoresetMode.SAME_STEP)
+        assert ResidualVectorWrapper(env, config.base, **config.settings.model_dump()).num_envs == 2
+
+
+@pytest.mark.parametrize("path", COMPARISONS, ids=lambda path: path.stem)
 def test_configurations_that_come_with_it_are_valid(path: Path) -> None:
     """Catches a name or a duration that does not exist: all policies in the first cell, all cells of the first."""
     config = load_yaml(path, CompareConfig)
