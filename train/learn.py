@@ -36,6 +36,7 @@ from train.evaluate import evaluate, make_vector_env
 from train.export import network_of
 from train.mixed_env import MixedVectorEnv
 from train.residual_env import ResidualVectorWrapper
+from train.runs import provenance
 from train.sb3_env import SB3VecEnv
 from train.state import capture, read_state, restore, write_state
 
@@ -128,6 +129,7 @@ class Training:
         self.model.action_space.seed(seed)
         self.best = np.inf
         self._base_scores: dict[str, tuple[float, int]] = {}
+        self._provenance = provenance(seed)
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
             self._resume()
@@ -313,7 +315,7 @@ class Training:
             activation=activation,  # type: ignore[arg-type]
             output=output,
             clip=float(self._normaliser.clip_obs),
-            training={"config": config.model_dump(mode="json"), "seed": self.seed, "decisions": self.done},
+            training={"config": config.model_dump(mode="json"), "decisions": self.done, **self._provenance},
         )
         return tensors, description
 

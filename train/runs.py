@@ -38,7 +38,7 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
     folder = _next_free(RUNS / name) if output is None else _empty(output)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True))
-    (folder / "metadata.json").write_text(json.dumps(_metadata(seed), indent=2) + "\n")
+    (folder / "metadata.json").write_text(json.dumps(provenance(seed), indent=2) + "\n")
     return folder
 
 
@@ -86,7 +86,8 @@ def _holds_results(folder: Path) -> bool:
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
-def _metadata(seed: int | None) -> dict[str, Any]:
+def provenance(seed: int | None) -> dict[str, Any]:
+    """When, from which commit and with which versions something is made."""
     return {
         "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),  # noqa: UP017  Python 3.11 has both
         "seed": seed,
