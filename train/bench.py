@@ -125,7 +125,7 @@ def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[Fig
     found = []
     for metric, accepted in case.figures.items():
         measured = float(episode.get(metric, np.nan)) if not episode["termination"] else float("nan")
-        bound = None if accepted is None else accepted * (1.0 + margin)
+        bound = None if accepted is None else accepted + margin * abs(accepted)
         found.append(Figure(name, metric, measured, accepted, bound, _problem(metric, measured, bound, episode)))
     return found
 
@@ -146,8 +146,8 @@ def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> N
     for case, evaluation in zip(content["cases"], evaluations, strict=True):
         (episode,) = evaluation.episodes
         if not episode["termination"]:
-            known = [metric for metric in case["figures"] if metric in episode]
-            case["figures"] = {metric: float(f"{episode[metric]:.4g}") for metric in known}
+            known = {metric: float(f"{episode[metric]:.4g}") for metric in case["figures"] if metric in episode}
+            case["figures"] |= known
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     path.write_text(_HEADER + text, encoding="utf-8")
 

@@ -152,6 +152,12 @@ class Train:
         """Train, or go on with it."""
         if (self.config is None) == (self.resume is None):
             raise ConfigurationError("name either a configuration or, with --resume, the run to go on with")
+        given = {"seeds": self.seeds, "decisions": self.decisions}
+        changes = {name: value for name, value in given.items() if value is not None}
+        if self.resume is not None and (changes or self.output is not None):
+            raise ConfigurationError(
+                "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
+            )
         try:
             from train.learn import TrainConfig
             from train.run_training import resume, start
@@ -164,8 +170,7 @@ class Train:
         else:
             config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
             with _options_named():
-                given = {"seeds": self.seeds, "decisions": self.decisions}
-                config = config.replace(**{name: value for name, value in given.items() if value is not None})
+                config = config.replace(**changes)
             folder = start(config, _CONSOLE, self.output)
         _CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
 

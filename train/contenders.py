@@ -159,7 +159,7 @@ class ScalarLoop:
 
 
 class PlainLoop:
-    """A loop of `mj_step` over one world on one thread, from the same start and under the same servo inputs."""
+    """A loop of `mj_step` over one world on one thread, from the same start, holding its first servo inputs."""
 
     title, num_envs = "plain mj_step loop", 1
 

@@ -13,7 +13,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import stable_baselines3
@@ -50,6 +50,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
         "train_freq": 4, "gradient_steps": 8, "policy_kwargs": {"net_arch": [64, 64]},
     },
 }  # fmt: skip
+_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _FIRST_TRAINING_SEED, _EVALUATION_SEED = 10_000_000, 50_000
 """Episodes of evaluation begin at the second, those of training above the first: no seed serves both."""
 
@@ -74,7 +75,7 @@ class TrainConfig(Model):
     """Its keyword arguments, over the defaults for PPO and SAC."""
     worlds: int = quantity("1", 64, ge=2, description="worlds, shared out to the scenarios")
     decisions: int = quantity("1", 200_000, ge=1, description="decisions of all worlds together")
-    seeds: list[int] = Field(default=[0], min_length=1)
+    seeds: list[Annotated[int, Field(ge=0)]] = Field(default=[0], min_length=1)
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, description="decisions between evaluations")
     evaluation_episodes: int = quantity("1", 4, ge=1, description="episodes per scenario in an evaluation")
@@ -92,7 +93,7 @@ class TrainConfig(Model):
             policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
             scenario=scenario,
             reference=self.motion,
-            episodes=1 if scenario.startswith("ideal") else self.evaluation_episodes,
+            episodes=1 if scenario == "ideal" else self.evaluation_episodes,
             seed=_EVALUATION_SEED,
         )
 
@@ -133,6 +134,7 @@ class Training:
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
             self._resume()
+        self._forget_later()
 
     @property
     def done(self) -> int:
@@ -162,7 +164,7 @@ class Training:
         return self.done // every > before // every or self.done >= self.config.decisions
 
     def checkpoint(self) -> None:
-        """Keep everything that the rest of the training depends on; what is there is replaced in one move."""
+        """Keep everything that the rest of the training depends on; a kill between its steps loses nothing."""
         fresh, old = self.folder / "checkpoint.new", self.folder / "checkpoint.old"
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir()
@@ -189,17 +191,17 @@ class Training:
             self.model.log_ent_coef.data.copy_(parameters["log_ent_coef"])
         torch.set_rng_state(parameters["rng"])
         self._load(read_state(path, "state"))
-        self._forget_later()
 
     def _forget_later(self) -> None:
-        """Drop evaluations that were made after the checkpoint; they will be made again."""
-        path = self.folder / "progress.csv"
-        if not path.exists():
+        """Drop evaluations that were made after the checkpoint, or without one; they will be made again."""
+        path, fresh = self.folder / "progress.csv", self.folder / "progress.csv.new"
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        kept = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",")[0]) <= self.done]
+        if self.done == 0 or not lines:
+            path.unlink(missing_ok=True)
             return
-        with path.open(newline="") as file:
-            header, *rows = csv.reader(file)
-        path.unlink()
-        _append(path, header, [row for row in rows if int(row[0]) <= self.done])
+        fresh.write_text("".join([lines[0], *kept]))
+        fresh.replace(path)
 
     def _parameters(self) -> dict[str, Any]:
         parameters = {
@@ -244,7 +246,7 @@ class Training:
         }
         if isinstance(model, OffPolicyAlgorithm):
             buffer = model.replay_buffer
-            names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+            names = [name for name in _REPLAY if hasattr(buffer, name)]
             size = buffer.buffer_size if buffer.full else buffer.pos  # type: ignore[union-attr]
             state["replay"] = {name: getattr(buffer, name)[:size] for name in names}
             state["replay_at"] = [buffer.pos, bool(buffer.full)]  # type: ignore[union-attr]
@@ -379,7 +381,7 @@ def _algorithm(name: str) -> Any:
             return getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigurationError(f"algorithm {name!r}: {error}") from None
-    known = ("A2C", "PPO", "SAC", "TD3")
+    known = ("A2C", "PPO", "SAC")
     if name not in known:
         raise unknown_name("algorithm", name, [*known, "module:Class"])
     return getattr(stable_baselines3, name)

@@ -52,7 +52,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every world; world i gets seed + i, or the i-th of a list of seeds."""
-        seeds: Any = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+        seeds: Any = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
         observations = []
         for env, worlds in zip(self.envs, self._worlds, strict=True):
             own: Any = None if seeds is None else list(seeds[worlds])

@@ -30,14 +30,13 @@ class _Deciding:
         self.settings = settings
         self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
         self.features = Features(self.corrected)
-        self._num_worlds = num_worlds
-        self.begin(np.ones(num_worlds, dtype=np.bool_))
+        self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
         self._state: Any = None
         self._past: Array | None = None
 
     def begin(self, worlds: BoolArray) -> None:
         """Episodes begin in some worlds, a (num_worlds,) mask."""
-        self._start, self._fresh = worlds.copy(), worlds.copy()
+        self._start, self._fresh = self._start | worlds, self._fresh | worlds
         if worlds.all():
             self._state = self._past = None
 
@@ -45,7 +44,7 @@ class _Deciding:
         """Features of the coming decision; the measurements count for some worlds only, or for all."""
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
         self._past = past if worlds is None or self._past is None else np.where(worlds[:, None], past, self._past)
-        self._fresh = np.zeros_like(self._fresh)
+        self._fresh = np.zeros_like(self._fresh) if worlds is None else self._fresh & ~worlds
         return features
 
     def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
@@ -166,6 +165,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._rows = np.zeros((env.num_envs, 0))
+        self._last: Array | None = None
         self._done = np.zeros(env.num_envs, dtype=np.bool_)
 
     @property
@@ -181,7 +181,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
             mask = np.asarray(options["reset_mask"])
         self._deciding.begin(mask)
         self._done = self._done & ~mask
-        return self._deciding.observe(self._rows), info
+        features = self._deciding.observe(self._rows, mask)
+        self._last = features if self._last is None else np.where(mask[:, None], features, self._last)
+        return self._last.copy(), info
 
     def spread(self, features: Array, generator: np.random.Generator) -> Array:
         """Let the base walk until the worlds are spread evenly over an episode, at decisions drawn from a generator.
@@ -197,10 +199,11 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
             if decision > 0 and begins.any():
                 features = self._restarted(begins, features)
             outcome = self._decide(idle, np.ones(self.num_envs, dtype=np.bool_))
-            features = self._deciding.observe(outcome.rows)
+            features = outcome.features
             ended = outcome.terminated | outcome.truncated
             if ended.any():
                 features = self._restarted(ended, features)
+        self._last = features.copy()
         return features
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -208,8 +211,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         residual = self._deciding.checked(actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
         outcome = self._decide(residual, ~waiting)
-        features = self._deciding.observe(outcome.rows)
-        info = outcome.info
+        features, info = outcome.features, outcome.info
         self._done = outcome.terminated | outcome.truncated
         if waiting.any():
             features = self._restarted(waiting, features)
@@ -221,6 +223,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
             final_info = dict(info)
             features = self._restarted(ended, features)
             info = {"final_obs": final, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
+        self._last = features.copy()
         return features, outcome.reward, outcome.terminated, outcome.truncated, info
 
     def _restarted(self, worlds: BoolArray, features: Array) -> Array:
@@ -234,16 +237,18 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         """Hold a residual for a decision period in the worlds that are alive."""
         n = self.num_envs
         reward, terminated, truncated = np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-        final: Array = self._rows
+        final: Array | None = None
         metrics: dict[str, Any] = {}
         reason = np.full(n, "", dtype="<U16")
         for _ in range(self.settings.decision_period):
-            command = self._deciding.act(self._rows, residual)
+            command = np.where(alive[:, None], self._deciding.act(self._rows, residual), np.float32(0.0))
             self._rows, gained, fell, finished, info = self.env.step(command)
             reward += np.where(alive, gained, 0.0)
             ended = alive & (fell | finished)
-            final = np.where(alive[:, None], self._rows, final)
             if ended.any():
+                # what they see last, with the memories as they are now: the others go on
+                last = self._deciding.observe(self._rows, ended)
+                final = last if final is None else np.where(ended[:, None], last, final)
                 terminated, truncated = terminated | (ended & fell), truncated | (ended & finished)
                 reason = np.where(ended, info["termination"], reason)
                 for name, values in info["episode_metrics"].items():
@@ -254,14 +259,20 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         info = {"termination": reason}
         if metrics:
             info |= {"episode_metrics": metrics, "_episode_metrics": terminated | truncated}
-        return _Outcome(final, reward, terminated, truncated, info)
+        features = self._deciding.observe(self._rows, ~(terminated | truncated))
+        if final is not None:
+            features = np.where((terminated | truncated)[:, None], final, features)
+        return _Outcome(features, reward, terminated, truncated, info)
 
 
 class _Outcome:
     """What a decision came to."""
 
-    def __init__(self, rows: Array, reward: Array, terminated: BoolArray, truncated: BoolArray, info: dict[str, Any]):
-        self.rows, self.reward, self.terminated, self.truncated, self.info = rows, reward, terminated, truncated, info
+    def __init__(
+        self, features: Array, reward: Array, terminated: BoolArray, truncated: BoolArray, info: dict[str, Any]
+    ) -> None:
+        self.features, self.reward, self.info = features, reward, info
+        self.terminated, self.truncated = terminated, truncated
 
 
 def _box(width: int) -> gymnasium.spaces.Box:

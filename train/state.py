@@ -2,7 +2,7 @@
 
 The state of an object of ours is that of its attributes: arrays that can be written to, random generators, plain
 values, records of rows, and containers and objects of these. What cannot change is left out: read-only arrays, frozen
-models, compiled physics models, functions. Nothing is pickled: a checkpoint is arrays and JSON.
+models, compiled physics models, functions. Nothing is pickled: a state is arrays and JSON.
 """
 
 import json
