@@ -209,6 +209,33 @@ def test_a_vector_of_worlds_is_the_scalar_wrapper(robot: str, base: str, space: 
     assert ends >= 3
 
 
+def test_restarts_in_a_row_lose_nothing() -> None:
+    """Catches a second restart that forgets the first, and one that moves the history of worlds that go on."""
+
+    def made() -> ResidualVectorWrapper:
+        env = ResidualVectorWrapper(vector("testbed", 3), "input", history=2)
+        env.reset(seed=3)
+        return env
+
+    env, generator = made(), np.random.default_rng(4)
+    for _ in range(12):
+        before, *_ = env.step(generator.uniform(-1.0, 1.0, (3, 1)))
+    for world in (0, 1):
+        seeds = [None] * 3
+        seeds[world] = 3 + world  # type: ignore[call-overload]
+        after, _ = env.reset(seed=seeds, options={"reset_mask": np.arange(3) == world})
+    np.testing.assert_array_equal(after[2], before[2])
+    anew, residual = made(), np.zeros((3, 1))
+    later, fresh = env.step(residual)[0], anew.step(residual)[0]
+    np.testing.assert_array_equal(later[:2], fresh[:2])
+    # six columns of the observation, then encoder and its rate at the last decision and at the one before
+    np.testing.assert_array_equal(later[2, 6:], [*before[2, :2], *before[2, 6:8]])
+    for _ in range(12):
+        residual = generator.uniform(-1.0, 1.0, (3, 1))
+        one, other = env.step(residual)[0], anew.step(residual)[0]
+        np.testing.assert_array_equal(one[:2], other[:2])
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("robot", ["walker", "testbed"])
 def test_checkers_of_gymnasium_and_sb3_pass(robot: str) -> None:

@@ -183,7 +183,27 @@ class PlainLoop:
         """See `Contender`."""
 
 
-class GymnasiumLoop:
+class _ForeignLoop:
+    """Scalar environments of ours in somebody else's vector environment, under zero offsets."""
+
+    title: str
+    num_envs: int
+    _env: Any
+    _action: Array
+
+    def run(self, steps: int) -> float:
+        """See `Contender`."""
+        begin = time.perf_counter()
+        for _ in range(steps):
+            self._env.step(self._action)
+        return self.num_envs * steps / (time.perf_counter() - begin)
+
+    def close(self) -> None:
+        """See `Contender`."""
+        self._env.close()
+
+
+class GymnasiumLoop(_ForeignLoop):
     """Scalar environments of ours under Gymnasium's SyncVectorEnv or AsyncVectorEnv, one process each in the latter."""
 
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
@@ -194,19 +214,8 @@ class GymnasiumLoop:
         self._env.reset(seed=0)
         self._action = np.zeros(self._env.action_space.shape or (), dtype=np.float32)
 
-    def run(self, steps: int) -> float:
-        """See `Contender`."""
-        begin = time.perf_counter()
-        for _ in range(steps):
-            self._env.step(self._action)
-        return self.num_envs * steps / (time.perf_counter() - begin)
 
-    def close(self) -> None:
-        """See `Contender`."""
-        self._env.close()
-
-
-class SB3Loop:
+class SB3Loop(_ForeignLoop):
     """Scalar environments of ours under SB3's DummyVecEnv or SubprocVecEnv, one process each in the latter."""
 
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
@@ -217,17 +226,6 @@ class SB3Loop:
         self._env = DummyVecEnv(makers) if kind == "DummyVecEnv" else SubprocVecEnv(makers, start_method="spawn")
         self._env.reset()
         self._action = np.zeros((num_envs, *(self._env.action_space.shape or ())), dtype=np.float32)
-
-    def run(self, steps: int) -> float:
-        """See `Contender`."""
-        begin = time.perf_counter()
-        for _ in range(steps):
-            self._env.step(self._action)
-        return self.num_envs * steps / (time.perf_counter() - begin)
-
-    def close(self) -> None:
-        """See `Contender`."""
-        self._env.close()
 
 
 class PPOLoop:
