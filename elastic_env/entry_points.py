@@ -18,8 +18,8 @@ from elastic_env.robots.testbed import Pendulum
 from elastic_env.robots.thormang import Thormang
 from elastic_env.scenario import Scenario, make_scenario
 from elastic_env.tasks.testbed import TestbedTask
-from elastic_env.tasks.testbed_config import TestbedConfig
-from elastic_env.tasks.walk_config import WalkConfig
+from elastic_env.tasks.testbed_config import RewardWeights, TestbedConfig
+from elastic_env.tasks.walk_config import WalkConfig, WalkRewardWeights
 from elastic_env.tasks.walk_in_place import WalkTask
 from elastic_env.walking.gait import Gait, make_gait
 
@@ -36,6 +36,7 @@ def configure_testbed(
     pendulum: Pendulum | dict[str, Any] | None = None,
     form: Literal["tendon", "rigid"] = "tendon",
     observe_link: bool = False,
+    reward: RewardWeights | dict[str, float] | None = None,
 ) -> TestbedConfig:
     """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
 
@@ -47,13 +48,12 @@ def configure_testbed(
         pendulum: The load, or a mapping of what differs from the default of 60 N·m at the horizontal.
         form: "tendon" for the elastic joint, "rigid" for what an inelastic testbed would do.
         observe_link: Whether the link's IMU is part of the observation.
+        reward: Weights of the reward terms, or a mapping of what differs from the default.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    for name, given, model in (("joint", joint, ElasticJoint), ("pendulum", pendulum, Pendulum)):
-        if not isinstance(given, dict | model | None):
-            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
+    _require_models(joint=(joint, ElasticJoint), pendulum=(pendulum, Pendulum), reward=(reward, RewardWeights))
     chosen = joint if isinstance(joint, ElasticJoint) else H54_200_S500_R.replace(**(joint or {}))
     if stiffness is not None:
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
@@ -64,6 +64,7 @@ def configure_testbed(
         pendulum=pendulum if isinstance(pendulum, Pendulum) else Pendulum(**(pendulum or {})),
         form=form,
         observe_link=observe_link,
+        reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
     )
 
 
@@ -76,6 +77,7 @@ def configure_walk(
     robot: Thormang | dict[str, Any] | None = None,
     gait: dict[str, Any] | None = None,
     form: Literal["tendon", "rigid"] = "tendon",
+    reward: WalkRewardWeights | dict[str, float] | None = None,
 ) -> WalkConfig:
     """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
 
@@ -89,13 +91,12 @@ def configure_walk(
         robot: The robot's options, or a mapping of them: hip_half_spacing, twin_knee, friction.
         gait: What differs from the default gait: lift_m, hip_height_m, transfer.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
+        reward: Weights of the reward terms, or a mapping of what differs from the default.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
-    for name, given, model in (("joint", joint, ElasticJoint), ("robot", robot, Thormang)):
-        if not isinstance(given, dict | model | None):
-            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
+    _require_models(joint=(joint, ElasticJoint), robot=(robot, Thormang), reward=(reward, WalkRewardWeights))
     if not isinstance(gait, dict | None):
         raise ConfigurationError(f"gait must be a mapping of {', '.join(_GAIT)}, got {gait!r}; see also step_period")
     for name in gait or {}:
@@ -115,7 +116,15 @@ def configure_walk(
         robot=chosen,
         joints=tuple(joints.values()),
         form=form,
+        reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
     )
+
+
+def _require_models(**arguments: tuple[Any, type[Any]]) -> None:
+    """Refuse arguments that are neither a model, nor a mapping of its parameters, nor left out."""
+    for name, (given, model) in arguments.items():
+        if not isinstance(given, dict | model | None):
+            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
 
 
 def make_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:

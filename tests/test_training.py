@@ -195,10 +195,14 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.Mo
 def test_train_command_trains_every_seed_and_resumes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches a seed that is left out, policies that nothing can play, and a resume that begins anew."""
+    """Catches a seed that is left out, seeds side by side that differ from one by one, and a resume that begins anew."""
     monkeypatch.chdir(tmp_path)
-    Path("c.yaml").write_text(yaml.safe_dump({"name": "mine", **SMALL, **PPO, "seeds": [3, 4]}))
-    main(["train", "c.yaml", "--decisions", "64"])
+    given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 64}
+    Path("c.yaml").write_text(yaml.safe_dump(given))
+    main(["train", "c.yaml", "--jobs", "2"])
+    Training(TrainConfig(**given), 4, tmp_path / "alone").run()
+    for name, tensor in weights(tmp_path / "alone" / "last").items():
+        np.testing.assert_array_equal(tensor, weights(tmp_path / "runs/mine/seed_4/last")[name], err_msg=name)
     assert "elastic train --resume runs/mine" in capsys.readouterr().out
     for seed in (3, 4):
         description, _ = load_residual(Path(f"runs/mine/seed_{seed}/last"))

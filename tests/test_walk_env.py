@@ -1099,6 +1099,18 @@ def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(sc
     np.testing.assert_allclose(info["servo_torque"], np.sqrt(np.mean(torque**2, axis=1)))
 
 
+def test_weights_of_the_reward_can_be_chosen() -> None:
+    """Catches an argument that arrives nowhere, and one that resets the other weights."""
+    rewards = []
+    for reward in (None, {"zmp": 100.0}):
+        env = walk_worlds(2, scenario="nominal", reward=reward)
+        env.reset(seed=0)
+        terms = env.step(np.zeros((2, 12)))[4]["reward_terms"]
+        rewards.append(terms)
+    np.testing.assert_allclose(rewards[1]["zmp"], 3.0 * rewards[0]["zmp"])
+    np.testing.assert_array_equal(rewards[1]["tilt"], rewards[0]["tilt"])
+
+
 def test_penalties_never_saturate() -> None:
     """Catches a kernel that hides how bad a large error is: twice the error costs twice as much."""
     errors = np.array([1e-3, 0.01, 0.2, 1.0])
@@ -1283,6 +1295,8 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
         ({"robot": {"hip": 1}}, r"unknown parameter of Thormang 'hip'; choose one of: hip_half_spacing, twin_knee"),
         ({"robot": {"friction": -1.0}}, r"Thormang\.friction must be a finite number > 0, got -1"),
         ({"robot": "mk1"}, r"robot must be a Thormang or a mapping of its parameters, got 'mk1'"),
+        ({"reward": {"tlit": 1.0}}, r"'tlit'.*Did you mean 'tilt'"),
+        ({"reward": 2.0}, r"reward must be a WalkRewardWeights or a mapping of its parameters, got 2.0"),
         ({"joint": 1001}, r"joint must be a ElasticJoint or a mapping of its parameters, got 1001"),
         ({"joint": {"servo": None}}, r"a servo is needed on every joint, but there is none on: l_hip_yaw, .*r_ankle_r"),
         ({"stiffness": [1, 2, 3]}, r"one number or 12 of them \[N·m/rad\].*l_hip_yaw, .*, got an array of shape \(3,"),

@@ -147,9 +147,13 @@ class Train:
     """Decisions of all worlds together instead of the configuration's."""
     output: Path | None = None
     """Folder for the run, new or empty; default runs/<name>, numbered if taken."""
+    jobs: int = 1
+    """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
 
     def run(self) -> None:
         """Train, or go on with it."""
+        if self.jobs < 0:
+            raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {self.jobs}")
         if (self.config is None) == (self.resume is None):
             raise ConfigurationError("name either a configuration or, with --resume, the run to go on with")
         given = {"seeds": self.seeds, "decisions": self.decisions}
@@ -166,12 +170,12 @@ class Train:
                 f"training needs {error.name}; install the extra: pip install 'elastic-env[train]'"
             ) from None
         if self.resume is not None:
-            folder = resume(self.resume, _CONSOLE)
+            folder = resume(self.resume, _CONSOLE, self.jobs)
         else:
             config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
             with _options_named():
                 config = config.replace(**changes)
-            folder = start(config, _CONSOLE, self.output)
+            folder = start(config, _CONSOLE, self.output, self.jobs)
         _CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
 
 

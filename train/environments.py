@@ -73,6 +73,7 @@ class Environment:
         figures: Names of the time series to draw, see `train.figures`.
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
+        judged: Columns that policies are compared by, pair by pair.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
     """
@@ -90,6 +91,7 @@ class Environment:
     figures: tuple[str, ...]
     overview: Column
     swept: tuple[Column, ...]
+    judged: tuple[Column, ...]
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     quantity: str = ""
     failure: str = "fail"
@@ -173,6 +175,7 @@ _TESTBED = Environment(
     figures=("time", "static"),
     overview=Column("link error rms", "link_error_rms_rad"),
     swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
+    judged=(Column("link error rms", "link_error_rms_rad"),),
 )  # fmt: skip
 
 _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
@@ -217,6 +220,7 @@ _WALKER = Environment(
     figures=("pelvis", "zmp"),
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
     quantity="step period",
     failure="falls",
 )  # fmt: skip

@@ -64,6 +64,8 @@ class TrainConfig(Model):
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: list[str] = Field(default=["nominal"], min_length=1)
     """Scenarios whose worlds are learned from together, in equal shares."""
+    env_options: dict[str, Any] = {}
+    """Further arguments of the environment, such as the weights of its reward."""
     base: str = "input_output"
     """Policy that is corrected."""
     base_options: dict[str, Any] = {}
@@ -73,6 +75,7 @@ class TrainConfig(Model):
     """Class of stable_baselines3, or "module:Class" of one that has the same interface."""
     algorithm_options: dict[str, Any] = {}
     """Its keyword arguments, over the defaults for PPO and SAC."""
+    clip: float = quantity("1", 10.0, gt=0, description="bound of normalised features, in standard deviations")
     worlds: int = quantity("1", 64, ge=2, description="worlds, shared out to the scenarios")
     decisions: int = quantity("1", 200_000, ge=1, description="decisions of all worlds together")
     seeds: list[Annotated[int, Field(ge=0)]] = Field(default=[0], min_length=1)
@@ -93,6 +96,7 @@ class TrainConfig(Model):
             policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
             scenario=scenario,
             reference=self.motion,
+            env_options=self.env_options,
             episodes=1 if scenario == "ideal" else self.evaluation_episodes,
             seed=_EVALUATION_SEED,
         )
@@ -105,22 +109,23 @@ class Training:
         config: What is trained.
         seed: Training seed.
         folder: Where its files go; one with a checkpoint is gone on with.
+        threads: Threads of the physics, 0 for all cores; the weights do not depend on it.
 
     Raises:
         ConfigurationError: Names or options that do not exist.
     """
 
-    def __init__(self, config: TrainConfig, seed: int, folder: Path) -> None:
+    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
         torch.set_num_threads(1)  # more would fight the threads of the physics
         torch.use_deterministic_algorithms(True)
-        self.config, self.seed, self.folder = config, seed, folder
+        self.config, self.seed, self.folder, self._threads = config, seed, folder, threads
         wrapped = [self._wrapped(scenario, share) for scenario, share in _shares(config)]
         self.settings = wrapped[0].settings
         self._spread = np.random.default_rng(seed)
-        self._worlds = SB3VecEnv(MixedVectorEnv(wrapped), self._spread)
+        self._worlds = SB3VecEnv(MixedVectorEnv(wrapped, threads), self._spread)
         options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
         gamma = options.get("gamma", 0.99)
-        self._normaliser = VecNormalize(self._worlds, norm_reward=True, gamma=gamma)
+        self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
         set_random_seed(seed)
         self._normaliser.seed(_FIRST_TRAINING_SEED + 100_000 * seed)
         self.model: Any = _algorithm(config.algorithm)(
@@ -129,7 +134,7 @@ class Training:
         self._shrink_last_layer()
         self.model.action_space.seed(seed)
         self.best = np.inf
-        self._base_scores: dict[str, tuple[float, int]] = {}
+        self._base_scores: dict[str, tuple[list[float], int]] = {}
         self._provenance = provenance(seed)
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
@@ -149,12 +154,9 @@ class Training:
         while self.done < config.decisions:
             before = self.done
             self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=10**9)
-            if self.done // config.evaluate_every > before // config.evaluate_every or self.done >= config.decisions:
+            if self._is_due(before, config.evaluate_every):
                 self._evaluate()
-            if (
-                self.done // config.checkpoint_every > before // config.checkpoint_every
-                or self.done >= config.decisions
-            ):
+            if self._is_due(before, config.checkpoint_every):
                 self.checkpoint()
             if progress is not None:
                 progress(self.done)
@@ -285,7 +287,7 @@ class Training:
     def _wrapped(self, scenario: str, worlds: int) -> ResidualVectorWrapper:
         config = self.config
         condition = config.condition(scenario, config.base)
-        threads = 1 if len(config.scenarios) > 1 else 0  # scenarios step side by side
+        threads = 1 if len(config.scenarios) > 1 else self._threads  # scenarios step side by side
         env = make_vector_env(condition, worlds, threads, AutoresetMode.SAME_STEP)
         base = baselines.make(config.base, env, **config.base_options)
         settings = config.settings.model_dump()
@@ -334,22 +336,18 @@ class Training:
         """Score the present policy against its base on episodes that training never sees; keep the best."""
         states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
         current = self._export("current")
-        table, primary = [], environment(self.config.env).overview.metric
+        columns = [column.metric for column in environment(self.config.env).judged]
+        table, ratios = [], []
         for scenario in self.config.scenarios:
             if scenario not in self._base_scores:
-                self._base_scores[scenario] = self._score(scenario, self.config.base, primary)
-            (mine, falls), (base, base_falls) = (
-                self._score(scenario, f"residual:{current}", primary),
-                self._base_scores[scenario],
-            )
-            table.append([self.done, scenario, mine, base, falls, base_falls])
-        _append(
-            self.folder / "progress.csv",
-            ["decisions", "scenario", primary, f"base_{primary}", "failed", "base_failed"],
-            table,
-        )
-        ratios = [row[2] / row[3] for row in table]
-        score = float(np.mean([10.0 if np.isnan(ratio) else ratio for ratio in ratios])) + sum(row[4] for row in table)
+                self._base_scores[scenario] = self._score(scenario, self.config.base, columns)
+            mine, falls = self._score(scenario, f"residual:{current}", columns)
+            base, base_falls = self._base_scores[scenario]
+            table.append([self.done, scenario, *mine, *base, falls, base_falls])
+            ratios.append(np.nan_to_num(np.array(mine) / base, nan=10.0).mean() + falls)
+        header = ["decisions", "scenario", *columns, *(f"base_{name}" for name in columns), "failed", "base_failed"]
+        _append(self.folder / "progress.csv", header, table)
+        score = float(np.mean(ratios))
         if score < self.best:
             self.best = score
             self._export("best")
@@ -358,11 +356,11 @@ class Training:
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
 
-    def _score(self, scenario: str, policy: str, metric: str) -> tuple[float, int]:
-        """Mean of a metric over the episodes that did not fail, and how many did."""
-        result = evaluate(self.config.condition(scenario, policy))
-        values = result.values(metric)
-        return (float(np.mean(values)) if len(values) else np.nan), result.num_failed
+    def _score(self, scenario: str, policy: str, metrics: list[str]) -> tuple[list[float], int]:
+        """Means of metrics over the episodes that did not fail, and how many did."""
+        result = evaluate(self.config.condition(scenario, policy), num_threads=self._threads)
+        values = [result.values(metric) for metric in metrics]
+        return [float(np.mean(some)) if len(some) else np.nan for some in values], result.num_failed
 
 
 def _shares(config: TrainConfig) -> list[tuple[str, int]]:

@@ -1,9 +1,9 @@
-"""`elastic train`: the training seeds of a configuration, one after the other, resumable at any moment."""
+"""`elastic train`: the training seeds of a configuration, in turn or side by side, resumable at any moment."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from elastic_env.config import load_yaml
@@ -11,17 +11,19 @@ from elastic_env.errors import ConfigurationError
 from train.environments import environment
 from train.learn import TrainConfig, Training, read_progress
 from train.runs import new_run
+from train.workers import progress_bar, side_by_side
 
 _CONFIG = "config.yaml"
 
 
-def start(config: TrainConfig, console: Console, output: Path | None = None) -> Path:
+def start(config: TrainConfig, console: Console, output: Path | None = None, jobs: int = 1) -> Path:
     """Train all seeds of a configuration in a new run.
 
     Args:
         config: What is trained.
         console: Where progress and results go.
         output: Folder, new or empty; default runs/<name>, numbered if taken.
+        jobs: Seeds at a time, 0 for one per core; the weights do not depend on it.
 
     Returns:
         The run's folder.
@@ -31,10 +33,10 @@ def start(config: TrainConfig, console: Console, output: Path | None = None) -> 
         ResultsExistError: The output folder holds results.
     """
     folder = new_run(config.name, config.model_dump(mode="json"), config.seeds[0], output)
-    return _train(config, folder, console)
+    return _train(config, folder, console, jobs)
 
 
-def resume(folder: Path, console: Console) -> Path:
+def resume(folder: Path, console: Console, jobs: int = 1) -> Path:
     """Go on with a run that was interrupted or killed; seeds that are complete stay as they are.
 
     Raises:
@@ -44,45 +46,50 @@ def resume(folder: Path, console: Console) -> Path:
         raise ConfigurationError(
             f"{folder} is no training run: it has no {_CONFIG}; name the folder that train printed"
         )
-    return _train(load_yaml(folder / _CONFIG, TrainConfig), folder, console)
+    return _train(load_yaml(folder / _CONFIG, TrainConfig), folder, console, jobs)
 
 
-def _train(config: TrainConfig, folder: Path, console: Console) -> Path:
+def _train(config: TrainConfig, folder: Path, console: Console, jobs: int) -> Path:
     console.print(f"training in {folder}; if it stops: elastic train --resume {folder}", soft_wrap=True)
-    with _bar(console) as bar:
-        for seed in config.seeds:
-            own = folder / f"seed_{seed}"
-            task = bar.add_task(f"seed {seed}", total=config.decisions)
-            if not (own / "last").is_dir():
-                training = Training(config, seed, own)
-                bar.update(task, completed=training.done)
-                training.run(lambda done, task=task: bar.update(task, completed=done))
-            bar.update(task, completed=config.decisions)
+    with progress_bar(console) as bar:
+        tasks = [bar.add_task(f"seed {seed}", total=config.decisions, start=False) for seed in config.seeds]
+
+        def report(number: int, done: int) -> None:
+            bar.start_task(tasks[number])
+            bar.update(tasks[number], completed=min(done, config.decisions))
+
+        if jobs == 1:
+            for number, seed in enumerate(config.seeds):
+                _train_seed(config, seed, folder, 0, lambda done, number=number: report(number, done))
+        else:  # one thread each: the seeds share the cores among them
+            side_by_side(_train_seed, [(config, seed, folder, 1) for seed in config.seeds], jobs, report)
     console.print(_table(config, folder))
     return folder
 
 
+def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]) -> None:
+    own = folder / f"seed_{seed}"
+    report(0)
+    if not (own / "last").is_dir():
+        training = Training(config, seed, own, threads)
+        report(training.done)
+        training.run(report)
+    report(config.decisions)
+
+
 def _table(config: TrainConfig, folder: Path) -> Table:
     """Scores of the last policies against their base, on the episodes of the evaluation on the way."""
-    column = environment(config.env).overview
-    table = Table(title=f"{column.label} of the last policy, on episodes that training never sees; base: {config.base}")
-    for name in ("seed", "scenario", "base", "with residual", "change", "failed"):
+    columns = environment(config.env).judged
+    table = Table(title=f"last policies on {config.base}, on episodes that training never sees")
+    for name in ("seed", "scenario", *(column.label for column in columns), "failed"):
         table.add_column(name, justify="left" if name == "scenario" else "right")
     for seed in config.seeds:
         rows = read_progress(folder / f"seed_{seed}")
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
-            mine, base = row[column.metric], row[f"base_{column.metric}"]
-            scores = (
-                f"{column.scale * base:.2f}",
-                f"{column.scale * mine:.2f}",
-                f"{100.0 * (mine / base - 1.0):+.0f} %",
-            )
+            scores = [_change(row[f"base_{column.metric}"], row[column.metric], column.scale) for column in columns]
             table.add_row(str(seed), row["scenario"], *scores, f"{row['failed']:.0f}")
     return table
 
 
-def _bar(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-        console=console,
-    )  # fmt: skip
+def _change(base: float, mine: float, scale: float) -> str:
+    return f"{scale * base:.2f} → {scale * mine:.2f} ({100.0 * (mine / base - 1.0):+.0f} %)"

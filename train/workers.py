@@ -1,12 +1,13 @@
-"""Conditions evaluated in processes of their own, with one progress bar for all."""
+"""Work in processes of its own, with what it reports on the way: conditions to evaluate, seeds to train."""
 
 import multiprocessing
 import os
 import queue
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing.managers import SyncManager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -20,30 +21,64 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
 
     The results do not depend on the number of processes.
     """
-    jobs = min(jobs or os.cpu_count() or 1, len(conditions))
     steps = [num_steps(condition) for condition in conditions]
     longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
+    with progress_bar(console, transient=True) as bar:
+        task = bar.add_task("control steps", total=sum(steps))
+        results = side_by_side(
+            _evaluate,
+            [(conditions[number],) for number in longest_first],
+            jobs,
+            lambda _, advance: bar.advance(task, advance),
+        )
+        bar.update(task, completed=sum(steps))
+    return [results[longest_first.index(number)] for number in range(len(conditions))]
+
+
+def side_by_side(
+    function: Callable[..., Any],
+    arguments: Sequence[tuple[Any, ...]],
+    jobs: int,
+    report: Callable[[int, Any], None],
+) -> list[Any]:
+    """Call a function with each of some arguments in processes of their own; the results are in their order.
+
+    Args:
+        function: At the top of a module; it gets the arguments and, behind them, a function that takes its reports.
+        arguments: Of each call.
+        jobs: Processes at a time, 0 for one per core.
+        report: Called with the number of the call and what it reported.
+
+    Raises:
+        Exception: The first that a call raised, when all others have been ended.
+    """
+    jobs = min(jobs or os.cpu_count() or 1, len(arguments))
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
     manager.start(_ignore_interrupts)
-    with _progress(console) as bar, manager:
-        task = bar.add_task("control steps", total=sum(steps))
-        done = manager.Queue()
+    with manager:
+        reports = manager.Queue()
         pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
         try:
-            submitted = {n: pool.submit(_evaluate_in_process, conditions[n], done) for n in longest_first}
-            futures = [submitted[n] for n in range(len(conditions))]
+            futures = [pool.submit(_call, function, given, n, reports) for n, given in enumerate(arguments)]
             while not all(future.done() for future in futures):
-                for advance in _drain(done):
-                    bar.advance(task, advance)
+                for number, value in _drain(reports):
+                    report(number, value)
                 _raise_first(futures)
             results = [future.result() for future in futures]
         except BaseException:
             _end(pool)
             raise
         pool.shutdown()
-        bar.update(task, completed=sum(steps))
     return results
+
+
+def progress_bar(console: Console, transient: bool = False) -> Progress:
+    """Progress of something that is counted, with times."""
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+        console=console, transient=transient,
+    )  # fmt: skip
 
 
 def _ignore_interrupts() -> None:
@@ -51,8 +86,8 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _raise_first(futures: Sequence[Future[Evaluation]]) -> None:
-    """The error of a condition that failed, as soon as it has."""
+def _raise_first(futures: Sequence[Future[Any]]) -> None:
+    """The error of a call that failed, as soon as it has."""
     for future in futures:
         if future.done():
             future.result()
@@ -68,22 +103,19 @@ def _end(pool: ProcessPoolExecutor) -> None:
         worker.join()
 
 
-def _evaluate_in_process(condition: Condition, steps: "queue.Queue[int]") -> Evaluation:
-    return evaluate(condition, progress=steps.put, num_threads=1)
+def _call(function: Callable[..., Any], given: tuple[Any, ...], number: int, reports: "queue.Queue[Any]") -> Any:
+    return function(*given, lambda value: reports.put((number, value)))
 
 
-def _drain(steps: "queue.Queue[int]") -> Iterator[int]:
+def _evaluate(condition: Condition, report: Callable[[int], None]) -> Evaluation:
+    return evaluate(condition, progress=report, num_threads=1)
+
+
+def _drain(reports: "queue.Queue[Any]") -> Iterator[Any]:
     """What has been put into the queue, waiting a little for the first."""
     try:
-        yield steps.get(timeout=0.2)
+        yield reports.get(timeout=0.2)
         while True:
-            yield steps.get_nowait()
+            yield reports.get_nowait()
     except queue.Empty:
         return
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-        console=console, transient=True,
-    )  # fmt: skip
