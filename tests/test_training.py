@@ -20,11 +20,14 @@ from baselines.residual import load_residual
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 from train.cli import main
-from train.learn import TrainConfig, Training, read_progress
+from train.constant_search import ConstantSearch
+from train.learn import Training
 from train.mixed_env import MixedVectorEnv
+from train.progress import read_progress
 from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv
 from train.state import capture, read_state, restore, write_state
+from train.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
@@ -83,7 +86,7 @@ def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     """Catches a checkpoint that is half written, and a kill that loses or repeats an evaluation."""
     code = (
         "from pathlib import Path; import sys; from tests.test_training import SMALL, PPO;"
-        "from train.learn import TrainConfig, Training;"
+        "from train.learn import Training; from train.train_config import TrainConfig;"
         "Training(TrainConfig(**{**SMALL, **PPO}), 1, Path(sys.argv[1])).run()"
     )
     killed, whole = tmp_path / "killed", tmp_path / "whole"
@@ -98,6 +101,50 @@ def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     for name, tensor in weights(whole / "last").items():
         np.testing.assert_array_equal(tensor, weights(killed / "last")[name], err_msg=name)
     assert read_progress(killed) == read_progress(whole)
+
+
+SEARCH: dict[str, Any] = {
+    **SMALL, "base": "input", "algorithm": "CMA-ES", "worlds": 8, "decisions": 1200, "evaluate_every": 600,
+    "checkpoint_every": 200, "algorithm_options": {"population_size": 8, "sigma": 0.3}, "scenarios": ["ideal+soft"],
+    "settings": {"decision_period": 10},
+}  # fmt: skip
+
+
+def test_the_search_finds_the_stiffness_that_is_wrong(tmp_path: Path) -> None:
+    """Catches a search up the hill, candidates mixed up among worlds, and constants that are exported wrongly.
+
+    With the true K at 0.7 of the assumed one, slow motion is compensated at 1 + r = 1 / 0.7.
+    """
+    slow = {"kind": "sine", "duration_s": 2.0, "onset_s": 1.5, "amplitude": 0.6, "frequency_hz": 0.1}
+    given = {"reference": slow, "base": "dynamic", "decisions": 3000, "evaluate_every": 3000, "checkpoint_every": 3000}
+    search = ConstantSearch(TrainConfig(**{**SEARCH, **given, "settings": {"decision_period": 25}}), 0, tmp_path)
+    search.run()
+    _, network = load_residual(tmp_path / "last")
+    found = network(np.random.default_rng(0).normal(size=(3, network.num_features)))
+    np.testing.assert_allclose(0.6 * found, 1.0 / 0.7 - 1.0, atol=0.02)
+    assert read_progress(tmp_path)[-1]["link_error_rms_rad"] < 0.1 * read_progress(tmp_path)[0]["link_error_rms_rad"]
+
+
+def interrupted(done: int) -> None:
+    """As by Ctrl-C."""
+    if done > 400:
+        raise KeyboardInterrupt
+
+
+def test_a_resumed_search_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
+    """Catches a search that begins anew, and one that forgets what it was told."""
+    config = TrainConfig(**SEARCH)
+    ConstantSearch(config, 1, tmp_path / "whole").run()
+    search = ConstantSearch(config, 1, tmp_path / "part")
+    with pytest.raises(KeyboardInterrupt):
+        search.run(interrupted)
+    resumed = ConstantSearch(config, 1, tmp_path / "part")
+    assert 0 < resumed.done < config.decisions
+    resumed.run()
+    np.testing.assert_array_equal(
+        weights(tmp_path / "whole" / "last")["bias0"], weights(tmp_path / "part" / "last")["bias0"]
+    )
+    assert read_progress(tmp_path / "whole") == read_progress(tmp_path / "part")
 
 
 @pytest.mark.parametrize("robot", ["testbed", "walker"])
@@ -195,7 +242,7 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.Mo
 def test_train_command_trains_every_seed_and_resumes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches a seed that is left out, seeds side by side that differ from one by one, and a resume that begins anew."""
+    """Catches a seed left out, seeds that differ side by side, policies without a player, a resume that begins anew."""
     monkeypatch.chdir(tmp_path)
     given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 64}
     Path("c.yaml").write_text(yaml.safe_dump(given))
@@ -232,6 +279,19 @@ def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: st
     """Catches a traceback, or hours of training of something else."""
     with pytest.raises(ConfigurationError, match=message):
         Training(TrainConfig(**{**SMALL, **PPO, **changes}), 0, tmp_path / "x")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"worlds": 7}, "each of 8 candidates in each scenario, 8, got worlds: 7"),
+        ({"algorithm_options": {"popsize": 8}}, "'popsize'.*population_size"),
+    ],
+)
+def test_a_search_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    """Catches a candidate without a world, and an option that is silently left out."""
+    with pytest.raises(ConfigurationError, match=message):
+        ConstantSearch(TrainConfig(**{**SEARCH, **changes}), 0, tmp_path)
 
 
 def test_the_right_model_is_rewarded() -> None:

@@ -27,11 +27,11 @@ from train.conditions import Condition, PolicySpec
 from train.contenders import RawWorlds, VectorLoop
 from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
-from train.learn import TrainConfig
 from train.residual_env import ResidualVectorWrapper
 from train.summary import failure_notes, print_summary, summary_table, write_summary
 from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.sweep_plots import draw_sweep
+from train.train_config import TrainConfig
 from train.walk_plots import draw_pelvis, draw_zmp, intervals
 
 SHORT = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}

@@ -163,8 +163,8 @@ class Train:
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
         try:
-            from train.learn import TrainConfig
             from train.run_training import resume, start
+            from train.train_config import TrainConfig
         except ModuleNotFoundError as error:
             raise ConfigurationError(
                 f"training needs {error.name}; install the extra: pip install 'elastic-env[train]'"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -9,11 +10,14 @@ from rich.table import Table
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError
 from train.environments import environment
-from train.learn import TrainConfig, Training, read_progress
+from train.progress import read_progress
 from train.runs import new_run
+from train.train_config import TrainConfig
 from train.workers import progress_bar, side_by_side
 
 _CONFIG = "config.yaml"
+CONSTANTS = "CMA-ES"
+"""Algorithm that searches constants instead of training a network."""
 
 
 def start(config: TrainConfig, console: Console, output: Path | None = None, jobs: int = 1) -> Path:
@@ -71,10 +75,20 @@ def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, repo
     own = folder / f"seed_{seed}"
     report(0)
     if not (own / "last").is_dir():
-        training = Training(config, seed, own, threads)
+        training = _trainer(config)(config, seed, own, threads)
         report(training.done)
         training.run(report)
     report(config.decisions)
+
+
+def _trainer(config: TrainConfig) -> type[Any]:
+    if config.algorithm == CONSTANTS:
+        from train.constant_search import ConstantSearch
+
+        return ConstantSearch
+    from train.learn import Training
+
+    return Training
 
 
 def _table(config: TrainConfig, folder: Path) -> Table:

@@ -1,0 +1,145 @@
+"""The cheap rival of a learned policy: constant residuals, found by CMA-ES on the same budget of decisions.
+
+Constants know nothing of the phase of the walk nor of any measurement, but there is nothing to explore wrongly. What a
+policy gains over them is what it makes of what it sees.
+"""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cmaes import CMA
+
+from baselines.residual import ResidualDescription
+from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.signals import Array
+from train.progress import Progress
+from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+
+_DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
+_CHECKPOINT = "checkpoint.json"
+
+
+class ConstantSearch:
+    """One training seed of a search, in a folder of its own, with the interface of `train.learn.Training`.
+
+    In space `model` the joints of the left and the right leg share their constant: robot and walk are symmetric, and
+    half as many numbers are found in less time. All candidates of a generation play the same episodes, as many in every
+    scenario as the worlds allow, and are told the mean sum of rewards. The policy is the mean of the distribution.
+
+    Args:
+        config: What is searched for; its algorithm_options may be population_size and sigma, in residuals.
+        seed: Training seed.
+        folder: Where its files go; one with a checkpoint is gone on with.
+        threads: Threads of the physics, 0 for all cores; the result does not depend on it.
+
+    Raises:
+        ConfigurationError: Names or options that do not exist, or fewer worlds than candidates.
+    """
+
+    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
+        options = {**_DEFAULTS, **config.algorithm_options}
+        if options.keys() != _DEFAULTS.keys():
+            raise unknown_name("option of CMA-ES", (options.keys() - _DEFAULTS.keys()).pop(), _DEFAULTS)
+        self.config, self.folder, self._population = config, folder, int(options["population_size"])
+        episodes = config.worlds // (len(config.scenarios) * self._population)
+        if episodes == 0:
+            needed = len(config.scenarios) * self._population
+            raise ConfigurationError(
+                f"CMA-ES needs a world for each of {self._population} candidates in each scenario, {needed}, "
+                f"got worlds: {config.worlds}"
+            )
+        self._episodes, self._first = episodes, FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
+        shares = [(scenario, episodes * self._population) for scenario in config.scenarios]
+        self._worlds = training_worlds(config, shares, threads)
+        first: Any = self._worlds.envs[0]
+        names = first.unwrapped.assumed_model.joint_names
+        corrected = [names[joint] for joint in config.settings.corrected_joints(names)]
+        if config.settings.space == "model":
+            corrected = [name.removeprefix("l_").removeprefix("r_") for name in corrected]
+        self._groups = np.unique(corrected, return_inverse=True)[1]
+        num_constants = int(self._groups.max()) + 1
+        bounds = np.tile([-1.0, 1.0], (num_constants, 1))
+        self._optimiser = CMA(
+            mean=np.zeros(num_constants), sigma=float(options["sigma"]), bounds=bounds, seed=seed,
+            population_size=self._population,
+        )  # fmt: skip
+        self._told: list[list[float]] = []
+        self.done = 0
+        folder.mkdir(parents=True, exist_ok=True)
+        self._progress = Progress(config, seed, folder, threads)
+        if (folder / _CHECKPOINT).exists():
+            self._resume()
+        self._progress.forget_after(self.done)
+
+    def run(self, progress: Callable[[int], None] | None = None) -> None:
+        """Search to the end of the configuration's decisions; `progress` is told the decisions done."""
+        config = self.config
+        if self.done == 0:
+            self._progress.evaluate(self.done, self._policy())
+        while self.done < config.decisions:
+            before, candidates = self.done, self._ask()
+            self._tell(candidates, self._play(candidates))
+            if config.is_due(config.evaluate_every, before, self.done):
+                self._progress.evaluate(self.done, self._policy())
+            if config.is_due(config.checkpoint_every, before, self.done):
+                self.checkpoint()
+            if progress is not None:
+                progress(self.done)
+        self._progress.keep("last", self.done, self._policy())
+
+    def checkpoint(self) -> None:
+        """Keep what the search was told: from its seed and that, its state follows."""
+        best = float(self._progress.best) if np.isfinite(self._progress.best) else None
+        fresh = self.folder / f"{_CHECKPOINT}.new"
+        with fresh.open("w", encoding="utf-8") as file:
+            json.dump({"decisions": self.done, "best": best, "told": self._told}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        fresh.replace(self.folder / _CHECKPOINT)
+
+    def _resume(self) -> None:
+        state = json.loads((self.folder / _CHECKPOINT).read_text(encoding="utf-8"))
+        for costs in state["told"]:
+            self._tell(self._ask(), np.array(costs))
+        self.done = state["decisions"]
+        self._progress.best = np.inf if state["best"] is None else state["best"]
+
+    def _ask(self) -> Array:
+        """Candidates of a generation, (population, constants)."""
+        return np.array([self._optimiser.ask() for _ in range(self._population)])
+
+    def _tell(self, candidates: Array, costs: Array) -> None:
+        self._optimiser.tell(list(zip(candidates, costs.tolist(), strict=True)))
+        self._told.append(costs.tolist())
+
+    def _play(self, candidates: Array) -> Array:
+        """Minus the mean sum of rewards of each candidate over an episode, (population,)."""
+        n, scenarios = self._worlds.num_envs, len(self.config.scenarios)
+        generation = len(self._told)
+        own = self._first + generation * self._episodes + np.arange(self._episodes)
+        self._worlds.reset(seed=np.tile(own, n // self._episodes).tolist())
+        # worlds in the order scenario, candidate, episode
+        residuals = np.tile(np.repeat(candidates[:, self._groups], self._episodes, axis=0), (scenarios, 1))
+        total, alive = np.zeros(n), np.ones(n, dtype=np.bool_)
+        while alive.any():
+            _, reward, terminated, truncated, _ = self._worlds.step(residuals)
+            total += np.where(alive, reward, 0.0)
+            self.done += int(alive.sum())
+            alive &= ~(terminated | truncated)
+        return -total.reshape(scenarios, self._population, self._episodes).mean(axis=(0, 2))
+
+    def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
+        """The mean of the distribution as a network whose output does not depend on its input."""
+        constants = self._optimiser.mean[self._groups]
+        (features,) = self._worlds.single_observation_space.shape or (0,)
+        tensors = {
+            "mean": np.zeros(features),
+            "std": np.ones(features),
+            "weight0": np.zeros((len(constants), features), dtype=np.float32),
+            "bias0": constants.astype(np.float32),
+        }
+        return tensors, self.config.description()

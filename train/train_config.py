@@ -1,0 +1,114 @@
+"""What is trained on what: the configuration of a training, and the worlds that it learns from."""
+
+from typing import Annotated, Any
+
+from gymnasium.vector import AutoresetMode
+from pydantic import Field
+
+import baselines
+from baselines.correction import ResidualSettings
+from baselines.residual import ResidualDescription
+from elastic_env.config import Model, quantity
+from elastic_env.errors import ConfigurationError
+from train.conditions import Condition, Motion, PolicySpec
+from train.environments import environment
+from train.evaluate import make_vector_env
+from train.mixed_env import MixedVectorEnv
+from train.residual_env import ResidualVectorWrapper
+
+FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
+"""Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""
+TRAINING_SEED_STRIDE = 100_000
+"""Distance of the episodes of two training seeds."""
+
+
+class TrainConfig(Model):
+    """What is trained on what."""
+
+    name: str = "train"
+    env: str = "walker"
+    reference: Motion = None
+    """Motion, as in a comparison; None for the environment's default."""
+    scenarios: list[str] = Field(default=["nominal"], min_length=1)
+    """Scenarios whose worlds are learned from together, in equal shares."""
+    env_options: dict[str, Any] = {}
+    """Further arguments of the environment, such as the weights of its reward."""
+    base: str = "input_output"
+    """Policy that is corrected."""
+    base_options: dict[str, Any] = {}
+    settings: ResidualSettings = ResidualSettings()
+    """How the residual acts and what it sees."""
+    algorithm: str = "PPO"
+    """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a search over
+    residuals that never change."""
+    algorithm_options: dict[str, Any] = {}
+    """Its keyword arguments, over the defaults."""
+    clip: float = quantity("1", 10.0, gt=0, description="bound of normalised features, in standard deviations")
+    worlds: int = quantity("1", 64, ge=2, description="worlds, shared out to the scenarios")
+    decisions: int = quantity("1", 200_000, ge=1, description="decisions of all worlds together")
+    seeds: list[Annotated[int, Field(ge=0)]] = Field(default=[0], min_length=1)
+    """Training seeds, each a run of its own."""
+    evaluate_every: int = quantity("1", 20_000, ge=1, description="decisions between evaluations")
+    evaluation_episodes: int = quantity("1", 4, ge=1, description="episodes per scenario in an evaluation")
+    checkpoint_every: int = quantity("1", 10_000, ge=1, description="decisions between checkpoints")
+
+    @property
+    def motion(self) -> Any:
+        """The reference, or the environment's default."""
+        return environment(self.env).default_reference if self.reference is None else self.reference
+
+    def condition(self, scenario: str, policy: str) -> Condition:
+        """A cell in which a policy is evaluated on the way."""
+        return Condition(
+            env=self.env,
+            policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
+            scenario=scenario,
+            reference=self.motion,
+            env_options=self.env_options,
+            episodes=1 if scenario == "ideal" else self.evaluation_episodes,
+            seed=EVALUATION_SEED,
+        )
+
+    def description(self, **network: Any) -> ResidualDescription:
+        """What an exported policy says of itself; `network` names its activation and output."""
+        return ResidualDescription(
+            robot=self.env, base=self.base, base_options=self.base_options, settings=self.settings, clip=self.clip,
+            **network,
+        )  # fmt: skip
+
+    def is_due(self, every: int, before: int, now: int) -> bool:
+        """Whether something that is done every so many decisions, and at the end, is due between two counts of them."""
+        return now // every > before // every or now >= self.decisions
+
+    @property
+    def shares(self) -> list[tuple[str, int]]:
+        """Worlds of each scenario; the first ones take what does not divide.
+
+        Raises:
+            ConfigurationError: Fewer than two for one of them.
+        """
+        count = len(self.scenarios)
+        if self.worlds < 2 * count:
+            raise ConfigurationError(f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}")
+        whole, rest = divmod(self.worlds, count)
+        return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
+
+
+def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> MixedVectorEnv:
+    """Worlds under residuals of the configuration's base.
+
+    Args:
+        config: What is trained.
+        shares: How many worlds of which scenario.
+        threads: Threads of the physics, 0 for all cores; the results do not depend on it.
+
+    Raises:
+        ConfigurationError: A name or an option that does not exist.
+    """
+    own = 1 if len(shares) > 1 else threads  # scenarios step side by side
+    wrapped = []
+    for scenario, worlds in shares:
+        env = make_vector_env(config.condition(scenario, config.base), worlds, own, AutoresetMode.SAME_STEP)
+        base = baselines.make(config.base, env, **config.base_options)
+        wrapped.append(ResidualVectorWrapper(env, base, **config.settings.model_dump()))
+    return MixedVectorEnv(wrapped, threads)
