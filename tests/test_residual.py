@@ -21,6 +21,7 @@ from baselines.correction import Corrected, Features, ResidualSettings
 from baselines.residual import Network, ResidualDescription, ResidualPolicy, load_residual, save_residual
 from elastic_env.errors import ActionError, ConfigurationError
 from elastic_env.signals import Array
+from train.cli import main
 from train.export import network_of
 from train.residual_env import ResidualVectorWrapper, ResidualWrapper
 from train.sb3_env import SB3VecEnv
@@ -307,6 +308,36 @@ def test_the_numpy_forward_pass_is_that_of_sb3(algorithm: Any, options: dict[str
     np.testing.assert_allclose(network(features), expected, rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(network(features[3:4])[0], network(features)[3], rtol=0.0, atol=1e-6)
     assert np.abs(expected).max() > 1e-3
+
+
+def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches code that is run unasked, and an export that loses the normalisation or the settings."""
+    monkeypatch.chdir(tmp_path)
+    model, venv, env = trained(PPO, n_steps=8, batch_size=16)
+    model.save("mine.zip")
+    venv.save("normaliser.pkl")
+    given = {"env": "testbed", "base": "input", "settings": env.settings.model_dump(mode="json")}
+    Path("c.yaml").write_text(json.dumps(given))
+    arguments = ["export", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
+    loaded = []
+    monkeypatch.setattr("train.export.algorithm_class", lambda name: loaded.append(name) or PPO)
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "--trust-pickle" in capsys.readouterr().err
+    assert loaded == []
+    assert not Path("runs").exists()
+    main([*arguments, "--trust-pickle"])
+    description, network = load_residual(Path("runs/mine"))
+    assert (description.base, description.settings) == ("input", env.settings)
+    features = np.random.default_rng(1).normal(size=(20, network.num_features))
+    expected, _ = model.predict(venv.normalize_obs(features), deterministic=True)
+    np.testing.assert_allclose(network(features), expected, rtol=0.0, atol=1e-6)
+    Path("no.zip").write_bytes(b"nothing")
+    with pytest.raises(SystemExit):
+        main(["export", "no.zip", "c.yaml", "--trust-pickle"])
+    assert "no.zip is no model" in capsys.readouterr().err
 
 
 def test_a_residual_of_a_folder_plays_what_the_wrapper_decided(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The command `elastic`: identify, evaluate, compare, train, bench, speed, play, demo."""
+"""The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, demo."""
 
 import os
 import re
@@ -180,6 +180,35 @@ class Train:
 
 
 @dataclass
+class Export:
+    """Turn a model that Stable-Baselines3 saved into a residual folder, which plays without torch and runs no code.
+
+    Example: elastic export model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl --trust-pickle
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """Zip of model.save()."""
+    config: Annotated[Path, tyro.conf.Positional]
+    """Configuration of its training: algorithm, base, settings."""
+    normaliser: Path | None = None
+    """File of VecNormalize.save(); leave it out where observations were not normalised."""
+    trust_pickle: bool = False
+    """SB3 keeps models as pickles: loading one runs code from it."""
+    output: Path | None = None
+    """Folder for the residual, new or empty; default runs/<name of the zip>, numbered if taken."""
+
+    def run(self) -> None:
+        """Export."""
+        from train.export import export_zip
+        from train.runs import free_folder
+        from train.train_config import TrainConfig
+
+        folder = free_folder(self.model.stem, self.output)
+        export_zip(self.model, load_yaml(self.config, TrainConfig), folder, self.normaliser, self.trust_pickle)
+        _CONSOLE.print(f"play it as residual:{folder}", soft_wrap=True)
+
+
+@dataclass
 class Bench:
     """Guard figures in CI: short rollouts of both environments against what was accepted.
 
@@ -304,6 +333,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Play, tyro.conf.subcommand("play")]

@@ -1,5 +1,8 @@
 """Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without torch."""
 
+import pickle
+import zipfile
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -7,7 +10,11 @@ import numpy.typing as npt
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
+from baselines.residual import save_residual
 from elastic_env.errors import ConfigurationError
+from train.algorithms import algorithm_class
+from train.runs import provenance
+from train.train_config import TrainConfig
 
 Tensors = dict[str, npt.NDArray[Any]]
 
@@ -44,3 +51,37 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
         tensors["mean"] = normaliser.obs_rms.mean.copy()
         tensors["std"] = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
     return tensors, names[activations.pop()], output  # type: ignore[return-value]
+
+
+def export_zip(
+    path: Path, config: TrainConfig, output: Path, normaliser: Path | None = None, trust_pickle: bool = False
+) -> Path:
+    """Turn a model that SB3 saved into a residual folder.
+
+    Args:
+        path: Zip of `model.save`.
+        config: What it was trained on: algorithm, base, settings and clip belong to the policy.
+        output: Folder to write.
+        normaliser: File of `VecNormalize.save`; None where observations were not normalised.
+        trust_pickle: Both are pickles, and loading a pickle runs code from it.
+
+    Raises:
+        ConfigurationError: Pickles that are not trusted, no model, or one that does not fit the configuration.
+    """
+    if not trust_pickle:
+        raise ConfigurationError(
+            f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if you trust its origin"
+        )
+    for file in (path, normaliser):
+        if file is not None and not file.is_file():
+            raise ConfigurationError(f"no model at {file}")
+    try:
+        model = algorithm_class(config.algorithm).load(path, device="cpu")
+        statistics = None if normaliser is None else pickle.loads(normaliser.read_bytes())
+    except (ValueError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError, AssertionError) as error:
+        raise ConfigurationError(f"{path} is no model that SB3's {config.algorithm} saved: {error}") from None
+    tensors, activation, kind = network_of(model, statistics)
+    training = {"config": config.model_dump(mode="json"), **provenance(None), "exported_from": path.name}
+    description = config.description(activation=activation, output=kind, training=training)
+    save_residual(output, description, tensors)
+    return output

@@ -5,7 +5,6 @@ A run is a folder per training seed: `checkpoint/` to go on from, `best/` and `l
 and resumed ends with the same weights, bit for bit, as one that was not.
 """
 
-import importlib
 import os
 import random
 import shutil
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import stable_baselines3
 import torch
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -23,7 +21,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual import ResidualDescription
-from elastic_env.errors import ConfigurationError, unknown_name
+from train.algorithms import algorithm_class
 from train.export import network_of
 from train.progress import Progress
 from train.sb3_env import SB3VecEnv
@@ -67,7 +65,7 @@ class Training:
         self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
         set_random_seed(seed)
         self._normaliser.seed(FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed)
-        self.model: Any = _algorithm(config.algorithm)(
+        self.model: Any = algorithm_class(config.algorithm)(
             "MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options)
         )
         self._shrink_last_layer()
@@ -234,19 +232,6 @@ class Training:
         torch.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
-
-
-def _algorithm(name: str) -> Any:
-    if ":" in name:
-        module, _, attribute = name.partition(":")
-        try:
-            return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigurationError(f"algorithm {name!r}: {error}") from None
-    known = ("A2C", "PPO", "SAC")
-    if name not in known:
-        raise unknown_name("algorithm", name, [*known, "CMA-ES", "module:Class"])
-    return getattr(stable_baselines3, name)
 
 
 def _merged(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:

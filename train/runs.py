@@ -35,11 +35,20 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
     Raises:
         ResultsExistError: The named output folder is not empty.
     """
-    folder = _next_free(RUNS / name) if output is None else _empty(output)
+    folder = free_folder(name, output)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True))
     (folder / "metadata.json").write_text(json.dumps(provenance(seed), indent=2) + "\n")
     return folder
+
+
+def free_folder(name: str, output: Path | None = None) -> Path:
+    """A folder to write results to: the one that is named, or runs/<name>, numbered if taken.
+
+    Raises:
+        ResultsExistError: The named folder is not empty.
+    """
+    return _next_free(RUNS / name) if output is None else _empty(output)
 
 
 @contextmanager
