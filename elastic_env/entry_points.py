@@ -78,6 +78,7 @@ def configure_walk(
     gait: dict[str, Any] | None = None,
     form: Literal["tendon", "rigid"] = "tendon",
     reward: WalkRewardWeights | dict[str, float] | None = None,
+    bank: int = 0,
 ) -> WalkConfig:
     """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
 
@@ -92,6 +93,7 @@ def configure_walk(
         gait: What differs from the default gait: lift_m, hip_height_m, transfer.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
+        bank: Number of the bank that random robots come from, to keep those that are learned from apart.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -117,6 +119,7 @@ def configure_walk(
         joints=tuple(joints.values()),
         form=form,
         reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
+        bank=bank,
     )
 
 

@@ -21,13 +21,14 @@ from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 from train.cli import main
 from train.constant_search import ConstantSearch
+from train.evaluate import make_vector_env
 from train.learn import Training
 from train.mixed_env import MixedVectorEnv
 from train.progress import read_progress
 from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv
 from train.state import capture, read_state, restore, write_state
-from train.train_config import TrainConfig
+from train.train_config import TrainConfig, training_worlds
 
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
@@ -237,6 +238,14 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.Mo
     assert len(trained) == 8
     evaluated = config.condition("nominal", "input")
     assert max(range(evaluated.seed, evaluated.seed + 1_000)) < min(trained)
+
+
+def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> None:
+    """Catches a score on robots that training has seen."""
+    config = TrainConfig(env="walker", scenarios=["spread"], worlds=2)
+    learned_from: Any = training_worlds(config, config.shares, 1).envs[0].unwrapped
+    evaluated: Any = make_vector_env(config.condition("spread", config.base), 2, 1).unwrapped
+    assert not set(learned_from.task._bank) & set(evaluated.task._bank)
 
 
 def test_train_command_trains_every_seed_and_resumes(

@@ -720,6 +720,7 @@ def test_the_bank_of_spread_fills_its_interval_and_is_the_same_everywhere(monkey
     assert 1.29 < factors.max() <= 1.3
     assert np.abs(np.corrcoef(factors.T) - np.eye(12)).max() < 5 / np.sqrt(64)
     assert robot_bank(make_scenario("spread")) == bank
+    assert not set(robot_bank(make_scenario("spread"), 1)) & set(bank)
     assert len(robot_bank(make_scenario("nominal"))) == 1
 
 

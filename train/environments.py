@@ -1,7 +1,7 @@
 """What the commands know of each environment: how it is made, what of it is kept, and how its figures are shown."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from elastic_env.errors import ConfigurationError, unknown_name
@@ -73,6 +73,7 @@ class Environment:
         figures: Names of the time series to draw, see `train.figures`.
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
+        learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.
         judged: Columns that policies are compared by, pair by pair.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
@@ -93,6 +94,7 @@ class Environment:
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
+    learned_from: dict[str, Any] = field(default_factory=dict)
     quantity: str = ""
     failure: str = "fail"
 
@@ -221,6 +223,7 @@ _WALKER = Environment(
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
     judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    learned_from={"bank": 1},
     quantity="step period",
     failure="falls",
 )  # fmt: skip

@@ -108,7 +108,9 @@ def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads:
     own = 1 if len(shares) > 1 else threads  # scenarios step side by side
     wrapped = []
     for scenario, worlds in shares:
-        env = make_vector_env(config.condition(scenario, config.base), worlds, own, AutoresetMode.SAME_STEP)
+        condition = config.condition(scenario, config.base)
+        apart = {**condition.environment.learned_from, **config.env_options}
+        env = make_vector_env(condition.replace(env_options=apart), worlds, own, AutoresetMode.SAME_STEP)
         base = baselines.make(config.base, env, **config.base_options)
         wrapped.append(ResidualVectorWrapper(env, base, **config.settings.model_dump()))
     return MixedVectorEnv(wrapped, threads)

@@ -45,6 +45,7 @@ class WalkConfig(Model):
     control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
     timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
     reward: WalkRewardWeights = WalkRewardWeights()
+    bank: int = quantity("1", 0, ge=0, description="bank of robots that a scenario draws from")
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
@@ -115,11 +116,11 @@ def floor_tilt(angle: float, direction: float) -> Array:
     return np.array([np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0])
 
 
-def robot_bank(scenario: Scenario) -> list[RobotDraw]:
-    """The robots of a scenario: one, or a bank, the same in every process."""
+def robot_bank(scenario: Scenario, number: int = 0) -> list[RobotDraw]:
+    """The robots of a scenario: one, or a bank, the same in every process; banks of other numbers have other robots."""
     if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
         return [RobotDraw()]
-    generator, n = np.random.default_rng(_BANK_SEED), len(LEG_JOINTS)
+    generator, n = np.random.default_rng(_BANK_SEED + number), len(LEG_JOINTS)
     return [
         RobotDraw(
             stiffness_factor=tuple((1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()),

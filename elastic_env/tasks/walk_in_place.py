@@ -102,7 +102,7 @@ class WalkTask:
         self.model = config.true_model()
         self._robot = robot
         self._at = JointAddresses.of(self.model, LEG_JOINTS)
-        self._bank = robot_bank(config.scenario)
+        self._bank = robot_bank(config.scenario, config.bank)
         self._springs = spring_ids(self.model) if config.form == "tendon" else None
         feet = [self.model.body(f"{side}_foot").id for side in SIDES]
         self._foot_sensors = FootSensors(
