@@ -207,6 +207,9 @@ def test_a_mixture_is_its_parts() -> None:
                     metrics = final["final_info"]["episode_metrics"]["link_error_rms_rad"]
                     assert info["final_info"]["episode_metrics"]["link_error_rms_rad"][world] == metrics[row]
     assert ends > 0
+    observation, _ = whole.reset(seed=[1, 2, 3], options={"reset_mask": np.array([False, True, False])})
+    again, _ = parts[0].reset(seed=[1, 2], options={"reset_mask": np.array([False, True])})
+    np.testing.assert_array_equal(observation[:2], again)
 
 
 def test_spread_worlds_stand_all_over_the_walk() -> None:

@@ -51,12 +51,17 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._worlds = [slice(end - env.num_envs, end) for env, end in zip(envs, ends, strict=True)]
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every world; world i gets seed + i, or the i-th of a list of seeds."""
+        """Begin an episode in every world, or in those of options["reset_mask"].
+
+        World i gets seed + i, or the i-th of a list of seeds.
+        """
         seeds: Any = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        mask = None if options is None else options.get("reset_mask")
         observations = []
         for env, worlds in zip(self.envs, self._worlds, strict=True):
             own: Any = None if seeds is None else list(seeds[worlds])
-            observations.append(env.reset(seed=own, options=options)[0])
+            chosen = options if mask is None else {**(options or {}), "reset_mask": np.asarray(mask)[worlds]}
+            observations.append(env.reset(seed=own, options=chosen)[0])
         return np.concatenate(observations), {}
 
     def spread(self, observation: Array, generator: np.random.Generator) -> Array:
