@@ -129,7 +129,7 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
     | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
-    | `residual:PATH` | a trained residual from its folder, around its base | the same |
+    | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |
 
     Args:
         name: As in the table.

@@ -21,6 +21,7 @@ from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array
 
 DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
+_SHIPPED = Path(__file__).parent / "trained"
 
 _BLOCK = 32
 """Rows that are multiplied at once: a larger product would be shared out to threads, which then wait busily for more
@@ -177,17 +178,30 @@ def save_residual(folder: Path, description: ResidualDescription, tensors: dict[
     (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
+def shipped() -> list[str]:
+    """Names of the residuals that come with the package, such as testbed/seed_0."""
+    return sorted(path.parent.relative_to(_SHIPPED).as_posix() for path in _SHIPPED.glob(f"*/*/{DESCRIPTION}"))
+
+
+def located(folder: Path) -> Path:
+    """A residual's folder: the path itself, or where nothing lies there, the one of that name in the package."""
+    own = _SHIPPED / folder
+    return own if not folder.exists() and own.exists() else folder
+
+
 def read_description(folder: Path) -> ResidualDescription:
-    """What a residual says of itself.
+    """What a residual says of itself; `folder` is a path or the name of a shipped one.
 
     Raises:
         ConfigurationError: There is none, or it is not valid.
     """
+    folder = located(folder)
     try:
         content = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(
-            f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({error.strerror})"
+            f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({error.strerror}), or the "
+            f"name of one that comes with the package: {', '.join(shipped())}"
         ) from None
     except ValueError as error:
         raise ConfigurationError(f"{folder / DESCRIPTION} is not JSON: {error}") from None
@@ -203,6 +217,7 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     Raises:
         ConfigurationError: There is none, or it is damaged.
     """
+    folder = located(folder)
     description = read_description(folder)
     try:
         tensors = load_file(folder / WEIGHTS)

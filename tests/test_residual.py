@@ -18,7 +18,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
 from baselines.correction import Corrected, Features, ResidualSettings
-from baselines.residual import Network, ResidualDescription, ResidualPolicy, load_residual, save_residual
+from baselines.residual import (
+    Network,
+    ResidualDescription,
+    ResidualPolicy,
+    load_residual,
+    read_description,
+    save_residual,
+    shipped,
+)
 from elastic_env.errors import ActionError, ConfigurationError
 from elastic_env.signals import Array
 from train.cli import main
@@ -338,6 +346,17 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     with pytest.raises(SystemExit):
         main(["export", "no.zip", "c.yaml", "--trust-pickle"])
     assert "no.zip is no model" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_residuals_that_come_with_the_package_are_found_by_name(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches a name that only works in the source tree, and a folder that was damaged or left out."""
+    monkeypatch.chdir(tmp_path)
+    robot = read_description(Path(name)).robot
+    policy: Any = baselines.make(f"residual:{name}", scalar(robot))
+    assert policy.corrected.settings == read_description(Path(name)).settings
 
 
 def test_a_residual_of_a_folder_plays_what_the_wrapper_decided(tmp_path: Path) -> None:
