@@ -36,7 +36,7 @@ SMALL: dict[str, Any] = {
     "env": "testbed", "reference": SINE, "base": "input", "worlds": 4, "decisions": 192, "evaluate_every": 96,
     "checkpoint_every": 32, "evaluation_episodes": 1, "settings": {"decision_period": 10, "history": 1},
 }  # fmt: skip
-PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}}
+PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}, "anneal": True}
 SAC = {"algorithm": "SAC", "algorithm_options": {"learning_starts": 32, "batch_size": 16, "gradient_steps": 1}}
 
 

@@ -68,6 +68,7 @@ class Training:
         self.model: Any = algorithm_class(config.algorithm)(
             "MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options)
         )
+        self._learning_rate = float(self.model.lr_schedule(1.0))
         self._shrink_last_layer()
         self.model.action_space.seed(seed)
         self._progress = Progress(config, seed, folder, threads)
@@ -88,6 +89,9 @@ class Training:
             self._evaluate()
         while self.done < config.decisions:
             before = self.done
+            if config.anneal:
+                rate = self._learning_rate * (1.0 - before / config.decisions)
+                self.model.lr_schedule = lambda _, rate=rate: rate
             self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=10**9)
             if config.is_due(config.evaluate_every, before, self.done):
                 self._evaluate()

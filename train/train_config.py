@@ -43,6 +43,8 @@ class TrainConfig(Model):
     residuals that never change."""
     algorithm_options: dict[str, Any] = {}
     """Its keyword arguments, over the defaults."""
+    anneal: bool = False
+    """Whether the learning rate falls linearly to zero over the decisions."""
     clip: float = quantity("1", 10.0, gt=0, description="bound of normalised features, in standard deviations")
     worlds: int = quantity("1", 64, ge=2, description="worlds, shared out to the scenarios")
     decisions: int = quantity("1", 200_000, ge=1, description="decisions of all worlds together")
