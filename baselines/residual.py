@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
+from pydantic import ValidationError, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -20,6 +20,8 @@ from elastic_env.config import Model
 from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array
 
+RESIDUAL = "residual:"
+"""Before the folder of a trained residual, where policies are named."""
 DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
 
 _BLOCK = 32
@@ -45,6 +47,22 @@ class ResidualDescription(Model):
     """Bound of normalised features, in standard deviations."""
     training: dict[str, Any] = {}
     """How it was trained: configuration, seed, versions, commit."""
+
+    @field_validator("base")
+    @classmethod
+    def _base_is_no_residual(cls, value: str) -> str:
+        return require_plain_base(value)
+
+
+def require_plain_base(name: str) -> str:
+    """The name of a base policy.
+
+    Raises:
+        ValueError: It is itself a residual, which could name another, or itself.
+    """
+    if name.startswith(RESIDUAL):
+        raise ValueError(f"the base of a residual must be no residual itself, got {name!r}; name a baseline")
+    return name
 
 
 class Network:

@@ -20,7 +20,8 @@ from baselines.residual import load_residual
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 from train.cli import main
-from train.learn import TrainConfig, Training, read_progress
+from train.learn import TrainConfig, Training
+from train.progress import read_progress
 from train.mixed_env import MixedVectorEnv
 from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv

@@ -99,7 +99,7 @@ class Evaluate:
                 scenarios=[self.scenario], policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes, seed=self.seed,
             )  # fmt: skip
-        _print_files(compare(config, _CONSOLE, self.output))
+        _print_files(compare(config, _CONSOLE, self.output, report=False))
 
 
 @dataclass

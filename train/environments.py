@@ -55,6 +55,30 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Signal:
+    """A traced signal in charts over time.
+
+    Attributes:
+        title: Words for it.
+        name: Its name in the trace.
+        unit: Unit in which it is shown.
+        scale: Factor from SI to that unit.
+        reference: Name of what it should be in the trace; None where that is zero.
+    """
+
+    title: str
+    name: str
+    unit: str
+    scale: float
+    reference: str | None = None
+
+    @property
+    def label(self) -> str:
+        """Title with unit."""
+        return f"{self.title} [{self.unit}]"
+
+
+@dataclass(frozen=True)
 class Environment:
     """An environment as the commands see it.
 
@@ -74,6 +98,7 @@ class Environment:
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
         judged: Columns that policies are compared by, pair by pair.
+        curves: Signals over time in the report.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
     """
@@ -92,6 +117,7 @@ class Environment:
     overview: Column
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
+    curves: tuple[Signal, ...]
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     quantity: str = ""
     failure: str = "fail"
@@ -176,6 +202,10 @@ _TESTBED = Environment(
     overview=Column("link error rms", "link_error_rms_rad"),
     swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
     judged=(Column("link error rms", "link_error_rms_rad"),),
+    curves=(
+        Signal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
+        Signal("link error", "link_error", "mrad", 1e3),
+    ),
 )  # fmt: skip
 
 _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
@@ -221,6 +251,11 @@ _WALKER = Environment(
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
     judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    curves=(
+        Signal("pelvis roll", "pelvis_roll", "mrad", 1e3),
+        Signal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
+        Signal("ZMP to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+    ),
     quantity="step period",
     failure="falls",
 )  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 import stable_baselines3
 import torch
 from gymnasium.vector import AutoresetMode
-from pydantic import Field
+from pydantic import Field, field_validator
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
 from baselines.correction import ResidualSettings
-from baselines.residual import ResidualDescription, save_residual
+from baselines.residual import ResidualDescription, require_plain_base, save_residual
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from train.conditions import Condition, Motion, PolicySpec
@@ -83,6 +83,8 @@ class TrainConfig(Model):
     evaluate_every: int = quantity("1", 20_000, ge=1, description="decisions between evaluations")
     evaluation_episodes: int = quantity("1", 4, ge=1, description="episodes per scenario in an evaluation")
     checkpoint_every: int = quantity("1", 10_000, ge=1, description="decisions between checkpoints")
+
+    _checked = field_validator("base")(require_plain_base)
 
     @property
     def motion(self) -> Any:
@@ -422,10 +424,3 @@ def _listed(value: Any) -> Any:
 
 def _tupled(value: Any) -> Any:
     return tuple(_tupled(part) for part in value) if isinstance(value, list) else value
-
-
-def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Evaluations on the way of a training seed, as its `progress.csv` has them."""
-    with (folder / "progress.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [{key: value if key == "scenario" else float(value) for key, value in row.items()} for row in rows]

@@ -9,7 +9,8 @@ from rich.table import Table
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError
 from train.environments import environment
-from train.learn import TrainConfig, Training, read_progress
+from train.learn import TrainConfig, Training
+from train.progress import read_progress
 from train.runs import new_run
 from train.workers import progress_bar, side_by_side
 
