@@ -21,8 +21,8 @@ from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 from train.cli import main
 from train.learn import TrainConfig, Training
-from train.progress import read_progress
 from train.mixed_env import MixedVectorEnv
+from train.progress import read_progress
 from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv
 from train.state import capture, read_state, restore, write_state

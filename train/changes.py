@@ -15,11 +15,14 @@ from elastic_env.signals import Array
 from train.environments import Column, environment
 from train.evaluate import Evaluation
 from train.families import Origin, origin
-from train.statistics import Estimate, Pairs, change, improvement, over_seeds, pair
+from train.statistics import Estimate, change, improvement, over_seeds, pair
 
 CEILING, HELD_OUT = "ceiling on the training condition", "held out"
 _DETERMINISTIC = "ideal"
 """Scenario in which nothing is random: training and evaluation see the same."""
+
+_SMALL = 0.0995
+"""Below it a share is shown with a decimal."""
 
 Groups = Mapping[str, Sequence[str]]
 
@@ -108,7 +111,11 @@ class Change:
         value = self.relative.value
         if not np.isfinite(value):
             return "nothing to compare: in no episode did both stay up to the end"
-        direction = "no change" if value == 0.0 else f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
+        direction = (
+            "no change"
+            if value == 0.0
+            else f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
+        )
         if not self.is_family:
             return f"{direction} (difference of means, no training seeds)"
         return {
@@ -123,7 +130,7 @@ def percent(value: float, signed: bool = True) -> str:
     """A share in per cent, with a decimal where it is small; - where there is none."""
     if not np.isfinite(value):
         return "-"
-    digits = 1 if abs(value) < 0.0995 else 0
+    digits = 1 if 0.0 < abs(value) < _SMALL else 0
     text = f"{100.0 * value:{'+' if signed else ''}.{digits}f}".replace("-", "−")
     return f"{text} %"
 
@@ -132,10 +139,10 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     """A share with its interval, such as −40 % [−45, −33]."""
     if estimate.low is None or estimate.high is None:
         return percent(estimate.value, signed)
-    digits = 1 if max(abs(estimate.low), abs(estimate.high)) < 0.0995 else 0
-    sign = "+" if signed else ""
-    low, high = (f"{100.0 * value:{sign}.{digits}f}".replace("-", "−") for value in (estimate.low, estimate.high))
-    return f"{percent(estimate.value, signed)} [{low}, {high}]"
+    values = estimate.value, estimate.low, estimate.high
+    number = f"{'+' if signed else ''}.{1 if max(map(abs, values)) < _SMALL else 0}f"
+    value, low, high = (f"{100.0 * value:{number}}".replace("-", "−") for value in values)
+    return f"{value} % [{low}, {high}]"
 
 
 def families(evaluations: Sequence[Evaluation]) -> dict[str, Origin]:
@@ -270,15 +277,14 @@ def _marks(trained: Origin | None, reference: str, scenarios: Sequence[str]) -> 
     motion = known.default_reference if trained.reference is None else trained.reference
     seen = known.label(motion) == reference  # type: ignore[arg-type]
     unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
-    marks = []
+    quantity = known.quantity or "reference"
     if unseen:
-        partly = len(unseen) < len(scenarios)
-        marks.append(f"{HELD_OUT}: {', '.join(unseen)}" if partly else HELD_OUT)
+        named = f": {', '.join(unseen)}" if len(unseen) < len(scenarios) else ""
+        return (f"{HELD_OUT}{named}" if seen else f"{HELD_OUT}{named or ' scenario'} and {quantity}",)
     if not seen:
-        marks.append(f"{HELD_OUT} {known.quantity or 'reference'}")
-    if not marks and any(scenario.split("+")[0] == _DETERMINISTIC for scenario in scenarios):
-        marks.append(CEILING)
-    return tuple(marks)
+        return (f"{HELD_OUT} {quantity}",)
+    deterministic = any(scenario.split("+")[0] == _DETERMINISTIC for scenario in scenarios)
+    return (CEILING,) if deterministic else ()
 
 
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:

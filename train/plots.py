@@ -25,7 +25,7 @@ _COLOURS = {
     "dynamic": "#7aa344",
     "oracle": "#8e5ea2",
 }
-_STRONG = ("#d9480f", "#b5179e", "#0b7285", "#997404", "#5f3dc4", "#2b8a3e", "#a61e4d", "#495057")
+_STRONG = ("#d6006c", "#e69500", "#3d3df5", "#00a63e", "#111111", "#00a5cf", "#a05a00", "#8a8a8a")
 """Of residuals and of one's own policies in the report: far from the baselines' and from one another."""
 FAILED = "#111111"
 """Colour of the mark of a failure that belongs to no policy alone."""
@@ -72,9 +72,7 @@ def colour(policy: str, index: int = 0) -> str:
 def colours(policies: Sequence[str]) -> dict[str, str]:
     """A colour for every policy of a comparison: those that have none of their own take the others in turn."""
     unnamed = [policy for policy in policies if policy not in _COLOURS]
-    return {
-        policy: _COLOURS.get(policy) or _STRONG[unnamed.index(policy) % len(_STRONG)] for policy in policies
-    }
+    return {policy: _COLOURS.get(policy) or _STRONG[unnamed.index(policy) % len(_STRONG)] for policy in policies}
 
 
 def line_style(policy: str) -> str:

@@ -108,7 +108,7 @@ def _what(results: Results) -> list[tuple[str, str]]:
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]
-    return found + [(f"residual {title}", _trained(origin)) for title, origin in results.families.items()]
+    return found + [(title, _trained(origin)) for title, origin in results.families.items()]
 
 
 def _trained(origin: Origin) -> str:
@@ -129,7 +129,7 @@ def _in_short(results: Results) -> list[str]:
             own = [row for row in rows if row.column == column]
             found += [
                 f"{title} against {row.base}, {column.title}, pooled over {row.scope}{_at(results, row)}: "
-                f"{percent_interval(row.relative)}{_marked(row)}. {_capital(row.sentence)}."
+                f"{percent_interval(row.relative)}{_marked(row)}: {row.sentence}."
                 for row in own
                 if row.is_group
             ]
@@ -271,7 +271,7 @@ def _add_changes(page: Page, results: Results) -> None:
     if others:
         page.section("Baselines against one another")
         page.text("Paired differences of means. Baselines are not trained: there are no training seeds to draw from.")
-        _add_table(page, "Table of differences", changes_html(others, colour, swept), len(others))
+        _add_table(page, "Table of differences", changes_html(others, colour, swept, False), len(others))
 
 
 def _add_table(page: Page, title: str, html: str, rows: int) -> None:
@@ -283,7 +283,9 @@ def _add_phases(page: Page, results: Results) -> None:
         page.section(title)
         page.text(_PHASES)
         head, rows = _scores(results, columns)
-        _add_table(page, f"Table ({len(rows)} rows)", table(head, rows, words=3 + len(results.swept_options)), len(rows))
+        _add_table(
+            page, f"Table ({len(rows)} rows)", table(head, rows, words=3 + len(results.swept_options)), len(rows)
+        )
 
 
 _PHASES = (
@@ -334,7 +336,9 @@ def _add_sweeps(page: Page, results: Results) -> None:
     if results.swept is not None:
         for reference in lines.references:
             for scenario in lines.scenarios:
-                points = {t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles}
+                points = {
+                    t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
+                }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
     elif len({_number(e) for e in results.evaluations} - {None}) >= MIN_SWEPT_REFERENCES:
         for scenario in lines.scenarios:

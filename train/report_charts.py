@@ -126,6 +126,7 @@ def forest(rows: Sequence[Change]) -> Chart:
     data: list[Spec] = []
     widest = max(len(name.replace("<b>", "").replace("</b>", "")) for name in names)
     layout = _layout(margin={"l": 7.4 * min(widest, 46) + 26, "r": 10, "t": 40, "b": 10})
+    layout["showlegend"] = False
     for number, column in enumerate(columns):
         axis = _nth(number)
         shown = [next(row for row in line if row.column == column) for line in lines]
@@ -138,8 +139,7 @@ def forest(rows: Sequence[Change]) -> Chart:
             chosen = [(i, row) for i, row in enumerate(shown) if row in finite and row.verdict == verdict]
             data.append(
                 {
-                    "type": "scatter", "mode": "markers", "name": words, "legendgroup": verdict,
-                    "showlegend": number == 0 and any(r.verdict == verdict for r in rows), "xaxis": f"x{axis}",
+                    "type": "scatter", "mode": "markers", "name": words, "showlegend": False, "xaxis": f"x{axis}",
                     "x": [_digits(100.0 * row.relative.value) for _, row in chosen], "y": [i for i, _ in chosen],
                     "error_x": _error([row.relative.scaled(100.0) for _, row in chosen], VERDICTS[verdict]),
                     "marker": {"size": 9, "color": VERDICTS[verdict], "symbol": [_symbol(row) for _, row in chosen],
@@ -164,9 +164,7 @@ def forest(rows: Sequence[Change]) -> Chart:
     layout["yaxis"] = _axis(
         range=[len(lines) - 0.4, -0.6], tickvals=list(range(len(lines))), ticktext=names, showgrid=False
     )
-    layout["legend"] = {"orientation": "h", "y": 0.0, "yanchor": "top", "x": 0.0, "xanchor": "left"}
-    layout["margin"]["b"] = 40
-    return Chart({"data": data, "layout": layout}, 110 + 27 * len(lines), "")
+    return Chart({"data": data, "layout": layout}, 80 + 27 * len(lines), "")
 
 
 def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:

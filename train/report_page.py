@@ -1,10 +1,10 @@
 """The page of the report: style, script, tables and charts as HTML that needs nothing from outside."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 
-from train.changes import Change, by_line, percent_interval
+from train.changes import CEILING, Change, by_line, percent_interval
 from train.report_charts import FONT, VERDICTS, Chart
 
 _STYLE = """
@@ -12,7 +12,7 @@ _STYLE = """
 * { box-sizing: border-box; }
 html { scroll-behavior: smooth; }
 body { margin: 0; background: white; color: var(--ink); font: 16px/1.55 FONT; }
-main { max-width: 1240px; margin: 0 auto; padding: 36px 28px 80px; }
+main { max-width: 1320px; margin: 0 auto; padding: 36px 28px 80px; }
 h1 { font-size: 30px; line-height: 1.25; margin: 0 0 4px; letter-spacing: -0.01em; }
 h2 { font-size: 22px; margin: 52px 0 8px; padding-top: 14px; border-top: 1px solid var(--line); }
 h3 { font-size: 17px; margin: 26px 0 4px; }
@@ -29,10 +29,11 @@ figure { margin: 10px 0 26px; } figcaption { color: var(--soft); font-size: 14.5
 .wide { overflow-x: auto; margin: 12px 0 22px; }
 table { border-collapse: collapse; font-size: 14px; width: 100%; font-variant-numeric: tabular-nums; }
 th { text-align: left; font-weight: 600; color: var(--soft); border-bottom: 1.5px solid var(--ink); padding: 6px 9px; vertical-align: bottom; }
-td { border-bottom: 1px solid #e8eaed; padding: 5px 9px; vertical-align: top; }
-td.n, th.n { text-align: right; white-space: nowrap; }
+td { border-bottom: 1px solid #e8eaed; padding: 5px 8px; vertical-align: top; }
+td.n, th.n { text-align: right; } td.n { white-space: nowrap; }
 td.name { white-space: nowrap; }
-tr.group td { font-weight: 600; background: var(--faint); }
+td.words { min-width: 170px; }
+tr.group td { background: var(--faint); } tr.group td:nth-child(-n+2) { font-weight: 600; }
 tr.head td { background: white; font-weight: 700; padding-top: 20px; border-bottom: 1px solid var(--line); font-size: 15px; }
 tr.first td { border-top: 1px solid #b7bec6; }
 .badge { display: inline-block; font-size: 12px; line-height: 1.45; font-weight: 500; padding: 0 7px; border-radius: 9px; margin-left: 6px;
@@ -157,13 +158,23 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str
     return f'<div class="wide"><table><thead><tr>{cells}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
 
 
-def changes_html(rows: Sequence[Change], colour: dict[str, str], swept: Sequence[str]) -> str:
-    """Table of paired changes, a heading per policy and base, a row per cell and metric."""
+def changes_html(
+    rows: Sequence[Change], colour: Mapping[str, str], swept: Sequence[str], with_sentences: bool = True
+) -> str:
+    """Table of paired changes, a heading per policy and base, a row per cell and metric.
+
+    Args:
+        rows: The changes.
+        colour: Colours of the policies.
+        swept: Names of options that a sweep varies.
+        with_sentences: Whether each row says what it shows.
+    """
     names = ["reference", "scenario", *(name.replace("_", " ") for name in swept), "metric"]
-    figures = ["base", "with it", "change", "better than base", "falls (base)"]
+    figures = ["base → with it", "change", "better than base", f"{rows[0].failure} (base)"]
     head = "".join(f"<th>{escape(name)}</th>" for name in names)
-    head += "".join(f'<th class="n">{escape(name)}</th>' for name in figures) + "<th>what it shows</th>"
-    width = len(names) + len(figures) + 1
+    head += "".join(f'<th class="n">{escape(name)}</th>' for name in figures)
+    head += "<th>what it shows</th>" if with_sentences else ""
+    width = len(names) + len(figures) + with_sentences
     lines, before = [], ("", "")
     for line in by_line(rows):
         first = line[0]
@@ -174,33 +185,32 @@ def changes_html(rows: Sequence[Change], colour: dict[str, str], swept: Sequence
                 f'<tr class="head"><td colspan="{width}"><span class="dot" style="background:{colour[first.policy]}">'
                 f"</span>{escape(first.policy)} against {escape(first.base)}{seeds}</td></tr>"
             )
-        lines += [_change_row(row, swept, number == 0) for number, row in enumerate(line)]
+        lines += [_change_row(row, swept, number == 0, with_sentences) for number, row in enumerate(line)]
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
 
 
-def _change_row(row: Change, swept: Sequence[str], is_first: bool) -> str:
+def _change_row(row: Change, swept: Sequence[str], is_first: bool, with_sentence: bool) -> str:
     badges = "".join(
-        f'<span class="badge{" ceiling" if mark.startswith("ceiling") else ""}">{escape(mark)}</span>'
-        for mark in row.marks
+        f' <span class="badge{" ceiling" if mark == CEILING else ""}">{escape(mark)}</span>' for mark in row.marks
     )
     if row.is_group:
-        badges = '<span class="badge pooled">pooled</span>' + badges
+        badges = ' <span class="badge pooled">pooled</span>' + badges
     where = [escape(row.reference), escape(row.scope) + badges] if is_first else ["", ""]
     values = [f"{row.swept[name]:g}" if name in row.swept else "-" for name in swept] if is_first else [""] * len(swept)
-    number = f".{row.column.decimals}f"
+    before, after = (f"{row.column.scale * value:.{row.column.decimals}f}" for value in (row.theirs, row.mine))
     figures = [
-        f"{row.column.scale * row.theirs:{number}} {row.column.unit}" if row.num_pairs else "-",
-        f"{row.column.scale * row.mine:{number}} {row.column.unit}" if row.num_pairs else "-",
+        f"{before} → {after} {row.column.unit}" if row.num_pairs else "-",
         f'<b style="color:{VERDICTS[row.verdict]}">{percent_interval(row.relative)}</b>',
         percent_interval(row.improvement, signed=False),
         _falls(row) if is_first else "",
     ]
     kinds = " ".join(kind for kind, holds in (("group", row.is_group), ("first", is_first)) if holds)
-    body = "".join(f'<td class="name">{text}</td>' for text in where)
-    body += "".join(f'<td class="n">{escape(text)}</td>' for text in values)
+    body = f'<td class="name">{where[0]}</td><td>{where[1]}</td>'
+    body += "".join(f'<td class="n">{text}</td>' for text in values)
     body += f'<td class="name">{escape(row.column.title)}</td>'
     body += "".join(f'<td class="n">{text}</td>' for text in figures)
-    return f'<tr class="{kinds}">{body}<td>{escape(row.sentence)}</td></tr>'
+    body += f'<td class="words">{escape(row.sentence)}</td>' if with_sentence else ""
+    return f'<tr class="{kinds}">{body}</tr>'
 
 
 def _falls(row: Change) -> str:
