@@ -23,6 +23,8 @@ _DETERMINISTIC = "ideal"
 
 _SMALL = 0.0995
 """Below it a share is shown with a decimal."""
+_LEAST = 0.005
+"""Below it a bound would look like zero without one."""
 
 Groups = Mapping[str, Sequence[str]]
 
@@ -140,7 +142,8 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     if estimate.low is None or estimate.high is None:
         return percent(estimate.value, signed)
     values = estimate.value, estimate.low, estimate.high
-    number = f"{'+' if signed else ''}.{1 if max(map(abs, values)) < _SMALL else 0}f"
+    is_fine = 0.0 < max(map(abs, values)) < _SMALL or any(0.0 < abs(value) < _LEAST for value in values)
+    number = f"{'+' if signed else ''}.{1 if is_fine else 0}f"
     value, low, high = (f"{100.0 * value:{number}}".replace("-", "−") for value in values)
     return f"{value} % [{low}, {high}]"
 
@@ -248,7 +251,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
             Change(
                 policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
                 reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
-                marks=_marks(trained, first.environment.label(first.reference), scenarios), column=column,
+                marks=_marks(trained, first.environment.label(first.reference), scenarios, first.swept), column=column,
                 per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
                 mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
                 theirs=_mean([[p.base for p in pairs] for pairs in seeds]),
@@ -267,7 +270,9 @@ def _mean(seeds: Sequence[Sequence[Array]]) -> float:
     return float(np.mean(means)) if means else float("nan")
 
 
-def _marks(trained: Origin | None, reference: str, scenarios: Sequence[str]) -> tuple[str, ...]:
+def _marks(
+    trained: Origin | None, reference: str, scenarios: Sequence[str], swept: Mapping[str, float]
+) -> tuple[str, ...]:
     """What training has seen of a row's condition."""
     if trained is None:
         return ()
@@ -284,7 +289,7 @@ def _marks(trained: Origin | None, reference: str, scenarios: Sequence[str]) -> 
     if not seen:
         return (f"{HELD_OUT} {quantity}",)
     deterministic = any(scenario.split("+")[0] == _DETERMINISTIC for scenario in scenarios)
-    return (CEILING,) if deterministic else ()
+    return (CEILING,) if deterministic and not swept else ()
 
 
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:

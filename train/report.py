@@ -100,11 +100,12 @@ def _what(results: Results) -> list[tuple[str, str]]:
     per_cell = sorted({len(e.episodes) for e in results.evaluations})
     versions = ", ".join(f"{name} {version}" for name, version in origin["versions"].items() if version)
     quantity = lines.environment.quantity or "reference"
+    each = " and training seed" if results.families else ""
     found = [
         ("policies", ", ".join(lines.titles)),
         (f"{quantity}s", ", ".join(lines.references)),
         ("scenarios", ", ".join(lines.scenarios)),
-        ("episodes", f"{_span(per_cell)} per cell and training seed, seeds {min(seeds)} to {max(seeds)}"),
+        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {min(seeds)} to {max(seeds)}"),
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]
@@ -257,16 +258,16 @@ def _add_changes(page: Page, results: Results) -> None:
     colour, swept = results.lines.colour, results.swept_options
     if trained:
         page.section("Residuals against their base")
+        drawn = results.swept is None
+        marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
         page.text(
             "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below zero; "
-            "red: above; grey: it includes zero, or there is none. Open circles are held out, stars are ceilings on the "
-            "training condition."
+            f"red: above; grey: it includes zero, or there is none.{marks}"
         )
-        if results.swept is None:
-            for title in results.families:
-                own = [row for row in trained if row.policy == title]
-                page.heading(f"{title} against {own[0].base}") if own else None
-                page.chart(forest(own)) if own else None
+        for title in dict.fromkeys(row.policy for row in trained if drawn):
+            own = [row for row in trained if row.policy == title]
+            page.heading(f"{title} against {own[0].base}")
+            page.chart(forest(own))
         _add_table(page, "Table of changes", changes_html(trained, colour, swept), len(trained))
     if others:
         page.section("Baselines against one another")

@@ -303,10 +303,10 @@ def _values(places: Sequence[float], estimates: Sequence[Estimate], cells: Seque
     for estimate, cell in zip(estimates, cells, strict=True):
         failed, played = sum(e.num_failed for e in cell), sum(len(e.episodes) for e in cell)
         what = cell[0].condition.environment.failure
-        crosses = f"  <b>✕ {what} {failed}/{played}</b>" if failed else ""
+        crosses = f'  <b style="color:{VERDICTS["higher"]}">✕ {what} {failed}/{played}</b>' if failed else ""
         known = np.isfinite(estimate.value)
         end = estimate.value if estimate.high is None else estimate.high
-        x.append(_digits(end) if known else 10**left)
+        x.append(_digits(end) if known else 10 ** (left + 1e-3))
         text.append(f"  {number_interval(estimate, column)}{crosses}" if known else crosses)
     return {
         "type": "scatter", "mode": "text", "x": x, "y": list(places), "text": text, "textposition": "middle right",

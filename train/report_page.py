@@ -15,6 +15,7 @@ body { margin: 0; background: white; color: var(--ink); font: 16px/1.55 FONT; }
 main { max-width: 1320px; margin: 0 auto; padding: 36px 28px 80px; }
 h1 { font-size: 30px; line-height: 1.25; margin: 0 0 4px; letter-spacing: -0.01em; }
 h2 { font-size: 22px; margin: 52px 0 8px; padding-top: 14px; border-top: 1px solid var(--line); }
+nav + h2 { border-top: 0; margin-top: 18px; }
 h3 { font-size: 17px; margin: 26px 0 4px; }
 p { max-width: 86ch; margin: 8px 0; }
 a { color: var(--link); text-decoration: none; } a:hover { text-decoration: underline; }
@@ -24,20 +25,20 @@ nav { display: flex; flex-wrap: wrap; gap: 4px 22px; padding: 12px 0; border-top
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 5px 22px; margin: 18px 0; font-size: 15px; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 ul { padding-left: 22px; max-width: 92ch; } li { margin: 4px 0; }
-code { font: 0.9em ui-monospace, "DejaVu Sans Mono", monospace; background: var(--faint); padding: 1px 5px; border-radius: 4px; }
-figure { margin: 10px 0 26px; } figcaption { color: var(--soft); font-size: 14.5px; max-width: 100ch; margin: 2px 0 6px; }
+figure { margin: 10px 0 26px; } figcaption { color: var(--soft); font-size: 14.5px; }
 .wide { overflow-x: auto; margin: 12px 0 22px; }
 table { border-collapse: collapse; font-size: 14px; width: 100%; font-variant-numeric: tabular-nums; }
-th { text-align: left; font-weight: 600; color: var(--soft); border-bottom: 1.5px solid var(--ink); padding: 6px 9px; vertical-align: bottom; }
+th { text-align: left; font-weight: 600; color: var(--soft); border-bottom: 1.5px solid var(--ink); padding: 6px 8px;
+     vertical-align: bottom; }
 td { border-bottom: 1px solid #e8eaed; padding: 5px 8px; vertical-align: top; }
 td.n, th.n { text-align: right; } td.n { white-space: nowrap; }
 td.name { white-space: nowrap; }
 td.words { min-width: 170px; }
 tr.group td { background: var(--faint); } tr.group td:nth-child(-n+2) { font-weight: 600; }
-tr.head td { background: white; font-weight: 700; padding-top: 20px; border-bottom: 1px solid var(--line); font-size: 15px; }
+tr.head td { font-weight: 700; padding-top: 20px; border-bottom: 1px solid var(--line); font-size: 15px; }
 tr.first td { border-top: 1px solid #b7bec6; }
-.badge { display: inline-block; font-size: 12px; line-height: 1.45; font-weight: 500; padding: 0 7px; border-radius: 9px; margin-left: 6px;
-         border: 1px solid #b08800; color: #7a5c00; background: #fff9e5; white-space: nowrap; }
+.badge { display: inline-block; font-size: 12px; line-height: 1.45; font-weight: 500; padding: 0 7px; margin-left: 4px;
+         border: 1px solid #b08800; border-radius: 9px; color: #7a5c00; background: #fff9e5; white-space: nowrap; }
 .badge.ceiling { border-color: #8250df; color: #6639ba; background: #f8f3ff; }
 .badge.pooled { border-color: #8c959f; color: #424a53; background: #f6f8fa; }
 .dot { display: inline-block; width: 11px; height: 11px; border-radius: 50%; margin-right: 8px; }
@@ -169,12 +170,12 @@ def changes_html(
         swept: Names of options that a sweep varies.
         with_sentences: Whether each row says what it shows.
     """
-    names = ["reference", "scenario", *(name.replace("_", " ") for name in swept), "metric"]
-    figures = ["base → with it", "change", "better than base", f"{rows[0].failure} (base)"]
-    head = "".join(f"<th>{escape(name)}</th>" for name in names)
+    figures = ["base → policy", "change", "better than base", f"{rows[0].failure} (base)"]
+    head = "<th>reference</th><th>scenario</th>"
+    head += "".join(f'<th class="n">{escape(name.replace("_", " "))}</th>' for name in swept) + "<th>metric</th>"
     head += "".join(f'<th class="n">{escape(name)}</th>' for name in figures)
     head += "<th>what it shows</th>" if with_sentences else ""
-    width = len(names) + len(figures) + with_sentences
+    width = 3 + len(swept) + len(figures) + with_sentences
     lines, before = [], ("", "")
     for line in by_line(rows):
         first = line[0]

@@ -64,7 +64,8 @@ def pair(mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], m
     """Pair episodes by their seed, whatever their order.
 
     Args:
-        mine, base: Records of episodes in one cell, with `seed`, `termination` and the metric.
+        mine: Records of episodes in one cell, with `seed`, `termination` and the metric.
+        base: The same of the base.
         metric: Name of the metric.
 
     Raises:
