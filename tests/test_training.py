@@ -196,7 +196,7 @@ def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.Mo
 def test_train_command_trains_every_seed_and_resumes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Catches a seed that is left out, seeds side by side that differ from one by one, and a resume that begins anew."""
+    """Catches a seed that is left out, seeds side by side that differ from one by one, a resume that begins anew."""
     monkeypatch.chdir(tmp_path)
     given = {"name": "mine", **SMALL, **PPO, "seeds": [3, 4], "decisions": 64}
     Path("c.yaml").write_text(yaml.safe_dump(given))

@@ -1,18 +1,13 @@
 """Paired changes of a comparison: every residual against its base, and every baseline against the same base."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-from rich import box
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from elastic_env.signals import Array
-from train.environments import Column, environment
+from train.environments import Column, Environment, environment
 from train.evaluate import Evaluation
 from train.families import Origin, origin
 from train.statistics import Estimate, change, improvement, over_seeds, pair
@@ -240,6 +235,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
     known = first.environment
     mine = [e for ours, _ in cells for e in ours]
     theirs = [e for _, others in cells for e in others]
+    marks = _marks(trained, _motion(known, first.reference), scenarios, first.swept)
     rows = []
     for column in known.judged:
         seeds = [
@@ -251,7 +247,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
             Change(
                 policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
                 reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
-                marks=_marks(trained, first.environment.label(first.reference), scenarios, first.swept), column=column,
+                marks=marks, column=column,
                 per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
                 mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
                 theirs=_mean([[p.base for p in pairs] for pairs in seeds]),
@@ -279,8 +275,7 @@ def _marks(
     if trained.scenarios is None:
         return ("training condition unknown",)
     known = environment(trained.environment)
-    motion = known.default_reference if trained.reference is None else trained.reference
-    seen = known.label(motion) == reference  # type: ignore[arg-type]
+    seen = _motion(known, known.default_reference if trained.reference is None else trained.reference) == reference
     unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
     quantity = known.quantity or "reference"
     if unseen:
@@ -292,83 +287,9 @@ def _marks(
     return (CEILING,) if deterministic and not swept else ()
 
 
-def write_statistics(rows: Sequence[Change], path: Path) -> Path:
-    """One row per change; metrics in SI units, changes and probabilities as shares of one."""
-    swept = list(dict.fromkeys(name for row in rows for name in row.swept))
-    records = [_record(row, swept) for row in rows]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*_HEAD, *swept, *_FIGURES])
-        writer.writerows(records)
-    return path
-
-
-_HEAD = ("policy", "base", "kind", "reference", "scope", "pooled", "marks")
-_FIGURES = (
-    "metric", "base_mean", "mean", "change", "change_low", "change_high", "improvement", "improvement_low",
-    "improvement_high", "training_seeds", "pairs", "failed", "episodes", "base_failed", "base_episodes",
-    "change_per_training_seed", "sentence",
-)  # fmt: skip
-
-
-def _record(row: Change, swept: Sequence[str]) -> list[object]:
-    return [
-        row.policy, row.base, "residual" if row.is_family else "baseline", row.reference, row.scope, row.is_group,
-        "; ".join(row.marks), *(row.swept.get(name, "") for name in swept), row.column.metric, row.theirs, row.mine,
-        *_cells(row.relative), *_cells(row.improvement), row.num_seeds, row.num_pairs, row.falls, row.episodes,
-        row.base_falls, row.base_episodes, " ".join(f"{value:.6g}" for value in row.per_seed), row.sentence,
-    ]  # fmt: skip
-
-
-def _cells(estimate: Estimate) -> tuple[object, object, object]:
-    low, high = ("" if bound is None else bound for bound in (estimate.low, estimate.high))
-    return estimate.value, low, high
-
-
-def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell; nothing without residuals."""
-    shown = [row for row in rows if row.is_family]
-    if not shown:
-        return
-    console.print(changes_table(shown))
-
-
-def changes_table(rows: Sequence[Change]) -> Table:
-    """Changes of residuals against their bases, a line per cell with all judged metrics.
-
-    Args:
-        rows: Changes of families, of one environment.
-    """
-    columns = list(dict.fromkeys(row.column for row in rows))
-    swept = list(dict.fromkeys(name for row in rows for name in row.swept))
-    seeds = sorted({row.num_seeds for row in rows})
-    over = f"over {'/'.join(map(str, seeds))} training seeds"
-    table = Table(
-        title=f"change against the base on the same episodes, interquartile mean {over}, 95 % interval",
-        caption="* the interval includes zero, or there is none: no difference shown",
-        box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
-    )  # fmt: skip
-    for name in ("residual", "reference", "scenario", *swept):
-        table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold")
-    for column in columns:
-        table.add_column(column.title, justify="right", no_wrap=True, vertical="bottom")
-    table.add_column(f"{rows[0].failure}\n(base)", justify="right", no_wrap=True, vertical="bottom")
-    previous: tuple[str, ...] = ()
-    for line in by_line(rows):
-        first = line[0]
-        if previous and previous[0] != first.policy:
-            table.add_section()
-        names = (first.policy, first.reference)
-        shown = ("", "") if names == previous else names
-        previous = names
-        values = {row.column: row for row in line}
-        table.add_row(
-            *map(escape, shown), escape(first.scope) + (f" ({escape('; '.join(first.marks))})" if first.marks else ""),
-            *(f"{first.swept[name]:g}" if name in first.swept else "-" for name in swept),
-            *(escape(_starred(values[column])) for column in columns), falls(first),
-            style="bold" if first.is_group else "",
-        )  # fmt: skip
-    return table
+def _motion(known: Environment, reference: Any) -> str:
+    """What of a reference training may have seen: its kind, or its step period whatever the number of steps."""
+    return known.label(known.arguments(reference)[known.motion])
 
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
@@ -377,16 +298,6 @@ def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     for row in rows:
         lines.setdefault((row.policy, row.base, row.reference, row.scope, *_items(row.swept)), []).append(row)
     return list(lines.values())
-
-
-def falls(row: Change) -> str:
-    """Failed episodes of all, and the base's in brackets; an exclamation mark where there are more."""
-    return f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes} ({row.base_falls}/{row.base_episodes})"
-
-
-def _starred(row: Change) -> str:
-    star = "" if row.verdict in ("lower", "higher") else " *"
-    return percent_interval(row.relative) + (star if np.isfinite(row.relative.value) else "")
 
 
 def _items(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:

@@ -11,13 +11,15 @@ from rich.console import Console
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from train import plots
-from train.changes import changes, merged, print_changes, write_statistics
+from train.changes import changes, merged
+from train.changes_tables import print_changes, write_statistics
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import Environment, Reference, environment
 from train.evaluate import Evaluation, make_policy, make_vector_env
 from train.families import expand
 from train.figures import draw_figures
-from train.report import Results, require_plotly, write_report
+from train.report import require_plotly, write_report
+from train.report_words import Results
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
 from train.workers import run_conditions
@@ -106,7 +108,8 @@ class CompareConfig(Model):
         entrants = expand(self.policies, with_bases)
         return [
             Condition(
-                env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label, scenario=scenario, swept=swept,
+                env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
+                scenario=scenario, swept=swept,
                 env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )

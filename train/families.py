@@ -1,6 +1,5 @@
 """Policies of a comparison with all training seeds of a residual, and with the base that each residual belongs to."""
 
-import glob
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -111,7 +110,9 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
         folder = Path(pattern)
         description = read_description(folder)
         return [(folder, _training_seed(folder, description), description)]
-    folders = sorted((Path(path) for path in glob.glob(pattern) if Path(path).is_dir()), key=_natural)
+    anchor = Path(pattern).anchor
+    found = Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
+    folders = sorted((path for path in found if path.is_dir()), key=_natural)
     if not folders:
         raise ConfigurationError(f"no folder matches {pattern!r}; a * stands for what training seeds differ in")
     members = []

@@ -191,7 +191,7 @@ def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:
             data += _curves(title, lines.colour[title], cell, signal, stride, where, first=number == 0)
         layout[f"yaxis{axis}"] = _axis(
             title=signal.label, domain=_share(len(signals) - 1 - number, len(signals), 0.05), anchor="x",
-            range=_range_of([e for cell in cells.values() for e in cell], signal), zeroline=True, zerolinecolor="#c4c9cf",
+            range=_range_of([e for cell in cells.values() for e in cell], signal), zeroline=True, zerolinecolor=_GRID,
         )  # fmt: skip
     layout["xaxis"] = _axis(
         title="time [s]", range=[float(time[0]), float(time[-1])], anchor=f"y{_nth(len(signals) - 1)}", showgrid=False
@@ -209,7 +209,7 @@ def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:
 
 
 def sweep(lines: Lines, points: Mapping[str, Mapping[float | None, list[Evaluation]]], label: str) -> Chart:
-    """Scores against a swept value; of families with the interval over training seeds, a level where nothing is swept.
+    """Scores against a swept value; of families with their interval, a level where nothing is swept.
 
     Args:
         lines: Policies and their colours.
@@ -370,7 +370,8 @@ def _sweep_lines(title: str, colour: str, own: Mapping[float | None, list[Evalua
     named = {"name": title, "showlegend": first}
     estimates = {value: level(cell, column).scaled(column.scale) for value, cell in own.items()}
     if None in own:
-        return [{**where, **named, "mode": "lines", "x": [values[0], values[-1]], "y": [_digits(estimates[None].value)] * 2,
+        y = [_digits(estimates[None].value)] * 2
+        return [{**where, **named, "mode": "lines", "x": [values[0], values[-1]], "y": y,
                  "line": {"color": colour, "width": 1.6, "dash": "dot"}}]  # fmt: skip
     x = [value for value in values if value in estimates]
     found = [estimates[value] for value in x]
@@ -394,8 +395,8 @@ def _filled(x: Sequence[float], low: Array, high: Array, colour: str, where: Spe
     ]
 
 
-def _fall_marks(title: str, colour: str, own: Mapping[float | None, list[Evaluation]], values: Sequence[float], row: int,
-                axis: str) -> Spec:  # fmt: skip
+def _fall_marks(title: str, colour: str, own: Mapping[float | None, list[Evaluation]], values: Sequence[float],
+                row: int, axis: str) -> Spec:  # fmt: skip
     """Crosses where a policy fails: filled where in all episodes, open where in some."""
     x, symbols = [], []
     for value in values:
