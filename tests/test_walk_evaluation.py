@@ -431,7 +431,8 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     main(["compare", "walks.yaml"])
     assert drawn == [["input", "rigid"]] * 2
     stem = "0.3+0.5+0.3_s_num_steps=1_ideal.png"
-    files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"}
+    reports = {"statistics.csv", "report.html", "report.md"}
+    files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"} | reports
     folder = Path("runs/walks")
     assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json"}
     printed = capsys.readouterr().out

@@ -119,7 +119,7 @@ class Change:
             "lower": direction,
             "higher": direction,
             "none": "the interval includes zero: no difference shown",
-            "unclear": f"{direction} with one training seed: no interval, so no claim about training",
+            "unclear": f"{direction} with one training seed: no interval",
         }[self.verdict]
 
 

@@ -52,6 +52,7 @@ class Lines:
         self.evaluations = list(evaluations)
         self.titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
         self.colour = colours(self.titles)
+        self.residuals = {e.condition.policy.title for e in evaluations if e.condition.member is not None}
         self.environment: Environment = evaluations[0].condition.environment
         self.references = list(dict.fromkeys(e.condition.reference_name for e in evaluations))
         self.scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
@@ -94,7 +95,8 @@ def ladder(lines: Lines, reference: str) -> Chart:
         edge = [math.log10(low) - 0.04 * room - 0.02, math.log10(max(high, low)) + 0.34 * room + 0.1]
         for title in lines.titles:
             chosen = [i for i, rung in enumerate(rungs) if rung[1] == title]
-            data.append(_rungs(title, lines.colour[title], [places[i] for i in chosen],
+            symbol = "diamond" if title in lines.residuals else "circle"
+            data.append(_rungs(title, lines.colour[title], symbol, [places[i] for i in chosen],
                                [estimates[i] for i in chosen], axis))  # fmt: skip
             data.append(_values([places[i] for i in chosen], [estimates[i] for i in chosen],
                                 [rungs[i][2] for i in chosen], column, edge[0], axis))  # fmt: skip
@@ -285,13 +287,15 @@ _VERDICT_WORDS = {
 }  # fmt: skip
 
 
-def _rungs(title: str, colour: str, places: Sequence[float], estimates: Sequence[Estimate], axis: str) -> Spec:
+def _rungs(title: str, colour: str, symbol: str, places: Sequence[float], estimates: Sequence[Estimate], axis: str
+           ) -> Spec:  # fmt: skip
+    """Points of a policy with their intervals."""
     kept = [(y, e) for y, e in zip(places, estimates, strict=True) if np.isfinite(e.value)]
     return {
         "type": "scatter", "mode": "markers", "name": title, "xaxis": f"x{axis}",
         "x": [_digits(e.value) for _, e in kept], "y": [y for y, _ in kept],
         "error_x": _error([e for _, e in kept], colour),
-        "marker": {"size": 10, "color": colour, "symbol": ["diamond" if e.has_interval else "circle" for _, e in kept]},
+        "marker": {"size": 10, "color": colour, "symbol": symbol},
         "hoverinfo": "x+name",
     }  # fmt: skip
 
@@ -370,13 +374,13 @@ def _sweep_lines(title: str, colour: str, own: Mapping[float | None, list[Evalua
     named = {"name": title, "showlegend": first}
     estimates = {value: level(cell, column).scaled(column.scale) for value, cell in own.items()}
     if None in own:
-        y = [_digits(estimates[None].value)] * 2
+        y = _numbers(np.full(2, estimates[None].value))
         return [{**where, **named, "mode": "lines", "x": [values[0], values[-1]], "y": y,
                  "line": {"color": colour, "width": 1.6, "dash": "dot"}}]  # fmt: skip
     x = [value for value in values if value in estimates]
     found = [estimates[value] for value in x]
     dash = "dash" if line_style(title) == "--" else "solid"
-    line = {**where, **named, "mode": "lines+markers", "x": x, "y": [_digits(e.value) for e in found],
+    line = {**where, **named, "mode": "lines+markers", "x": x, "y": _numbers(np.array([e.value for e in found])),
             "marker": {"size": 7}, "line": {"color": colour, "width": 2, "dash": dash}}  # fmt: skip
     if not any(e.has_interval for e in found):
         return [line]

@@ -101,7 +101,7 @@ def over_seeds(values: Sequence[float]) -> Estimate:
     Args:
         values: One per training seed; those that are nan have no figure and are left out.
     """
-    found = np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
+    found = np.sort(np.array([value for value in values if np.isfinite(value)], dtype=np.float64))
     if len(found) == 0:
         return Estimate(float("nan"))
     value = float(interquartile_mean(found))
@@ -121,8 +121,8 @@ def improvement(seeds: Sequence[Sequence[Pairs]]) -> Estimate:
     """
     counts = [sum(map(len, scenarios)) for scenarios in seeds]
     wins = [sum(_wins(pairs) for pairs in scenarios) for scenarios in seeds]
-    won = np.array([w for w, n in zip(wins, counts, strict=True) if n > 0], dtype=np.float64)
-    played = np.array([n for n in counts if n > 0], dtype=np.float64)
+    both = sorted((w, n) for w, n in zip(wins, counts, strict=True) if n > 0)
+    won, played = np.array(both, dtype=np.float64).reshape(-1, 2).T
     if len(played) == 0:
         return Estimate(float("nan"))
     share = _share(won, played)
@@ -132,7 +132,7 @@ def improvement(seeds: Sequence[Sequence[Pairs]]) -> Estimate:
 
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
-    """Percentile bootstrap over training seeds; the same samples give the same interval."""
+    """Percentile bootstrap over training seeds; the same samples, sorted, give the same interval."""
     found = stats.bootstrap(
         samples, statistic, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile", paired=True,
         vectorized=True, rng=np.random.default_rng(_BOOTSTRAP_SEED),
