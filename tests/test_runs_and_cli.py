@@ -543,7 +543,7 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
         (["evaluate", "--help"], ["a list of one per joint", "twelve on the walker", "identification.json"]),
         (["play", "--help"], ["walker", "--reference", ".mp4"]),
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
-        (["compare", "--help"], ["configs/", "episodes.csv", "--jobs"]),
+        (["compare", "--help"], ["configs/", "episodes.csv", "report.html", "residual:PATH", "--jobs"]),
         (["identify", "--help"], ["--second-mass", "N·m/rad", "identification.json"]),
     ],
 )

@@ -225,6 +225,7 @@ def test_train_command_trains_every_seed_and_resumes(
         ({"algorithm": "nowhere:Class"}, "nowhere"),
         ({"worlds": 3, "scenarios": ["nominal", "soft"]}, "two per scenario, 4, got 3"),
         ({"base": "inptu"}, "'inptu'.*input"),
+        ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
         ({"scenarios": ["sotf"]}, "'sotf'.*soft"),
         ({"base": "zero"}, "compensates none; use space 'joint'"),
     ],

@@ -380,8 +380,9 @@ def test_trainings_that_come_with_it_are_valid(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", COMPARISONS, ids=lambda path: path.stem)
-def test_configurations_that_come_with_it_are_valid(path: Path) -> None:
+def test_configurations_that_come_with_it_are_valid(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a name or a duration that does not exist: all policies in the first cell, all cells of the first."""
+    monkeypatch.chdir(Path(__file__).parents[1])  # where the paths of residuals begin
     config = load_yaml(path, CompareConfig)
     cells = config.conditions()
     assert config.name == path.stem
