@@ -311,9 +311,20 @@ def test_conditions_are_marked_by_what_training_has_seen() -> None:
     cells = [cell("base", {"all": [2.0]}, s) for s in ("ideal", "slope")]
     learned = [e for s in ("ideal", "slope") for e in family([[1.0], [1.5]], s)]
     rows = changes([*cells, *learned], {"both": ["ideal", "slope"]})
-    pooled = [row for row in rows if row.is_group]
+    pooled = [row for row in rows if row.is_group and row.is_judged]
     assert [row.marks for row in pooled] == [("held out: slope",)] * 2
     np.testing.assert_allclose(pooled[0].per_seed, [-0.5, -0.25])
+
+
+def test_roll_and_pitch_stand_in_the_tables_and_do_not_judge() -> None:
+    """Catches figures that a reader of the walk looks for and does not find, and a verdict counted twice."""
+    base = cell("base", {"all": [2.0]}, "soft")
+    for e in (learned := family([[1.0]])) + [base]:
+        e.episodes[0]["pelvis_roll_rms_rad"] = 4.0 if e is base else 1.0
+    rows = {row.column.metric: row for row in changes([base, *learned]) if row.policy == "learned"}
+    assert [name for name, row in rows.items() if row.is_judged] == ["pelvis_error_rms_rad", "zmp_deviation_rms_m"]
+    assert rows["pelvis_roll_rms_rad"].relative.value == -0.75
+    assert "nothing to compare" in rows["pelvis_pitch_rms_rad"].sentence
 
 
 def test_a_residual_of_unknown_training_is_called_so() -> None:

@@ -37,6 +37,7 @@ class Change:
         swept: Options that a sweep varies, and their values.
         marks: What the reader has to know of the row: a ceiling, something held out.
         column: The metric.
+        is_judged: Whether policies are judged by it; else it stands in tables alone.
         per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
         relative: Interquartile mean of it over training seeds.
         improvement: Probability that an episode is better than the base's.
@@ -56,6 +57,7 @@ class Change:
     swept: dict[str, float]
     marks: tuple[str, ...]
     column: Column
+    is_judged: bool
     per_seed: Array
     relative: Estimate
     improvement: Estimate
@@ -237,7 +239,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
     theirs = [e for _, others in cells for e in others]
     marks = _marks(trained, _motion(known, first.reference), scenarios, first.swept)
     rows = []
-    for column in known.judged:
+    for column in (*known.judged, *known.also):
         seeds = [
             [pair(ours[number].episodes, others[0].episodes, column.metric) for ours, others in cells]
             for number in range(len(cells[0][0]))
@@ -247,7 +249,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
             Change(
                 policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
                 reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
-                marks=marks, column=column,
+                marks=marks, column=column, is_judged=column in known.judged,
                 per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
                 mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
                 theirs=_mean([[p.base for p in pairs] for pairs in seeds]),

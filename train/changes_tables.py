@@ -49,7 +49,7 @@ def _cells(estimate: Estimate) -> tuple[object, object, object]:
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
     """Print the changes of the residuals, a line per cell; nothing without residuals."""
-    shown = [row for row in rows if row.is_family]
+    shown = [row for row in rows if row.is_family and row.is_judged]
     if not shown:
         return
     console.print(changes_table(shown))

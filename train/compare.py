@@ -78,6 +78,9 @@ class CompareConfig(Model):
     def _names_exist(self) -> Self:
         environment(self.env)
         titles = [policy.title for policy in self.policies]
+        for title in titles:
+            if titles.count(title) > 1:
+                raise ConfigurationError(f"two policies are called {title!r}; give one of them a label")
         for title in self.figure_policies:
             if title not in titles:
                 raise unknown_name("policy of the figures", title, titles)

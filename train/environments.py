@@ -98,6 +98,7 @@ class Environment:
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
         judged: Columns that policies are compared by, pair by pair.
+        also: Columns whose paired changes stand in the tables too.
         curves: Signals over time in the report.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
@@ -118,6 +119,7 @@ class Environment:
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
     curves: tuple[Signal, ...]
+    also: tuple[Column, ...] = ()
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     quantity: str = ""
     failure: str = "fail"
@@ -251,6 +253,7 @@ _WALKER = Environment(
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
     judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    also=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
     curves=(
         Signal("pelvis roll", "pelvis_roll", "mrad", 1e3),
         Signal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),

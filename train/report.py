@@ -91,7 +91,7 @@ def _add_changes(page: Page, results: Results) -> None:
             f"zero; red: above; grey: it includes zero, or there is none.{marks}"
         )
         for title in dict.fromkeys(row.policy for row in trained if drawn):
-            own = [row for row in trained if row.policy == title]
+            own = [row for row in trained if row.policy == title and row.is_judged]
             page.heading(f"{title} against {own[0].base}")
             page.chart(forest(own))
         _add_table(page, "Table of changes", changes_html(trained, colour, swept), len(trained))

@@ -22,8 +22,10 @@ _INK, _GRID, _FRAME = "#1f2328", "#e8eaed", "#8b949e"
 _SHADE = "#f1f3f5"
 VERDICTS = {"lower": "#1a7f5a", "higher": "#b42318", "none": "#6e7781", "unclear": "#6e7781"}
 """Colours of what a row shows."""
-_POINTS = 600
-"""Most points of a line."""
+_POINTS, _LEAST_POINTS, _ALL_POINTS = 600, 250, 6000
+"""Most points of a line; the least of that and of all cells together, so that a large comparison stays small."""
+_LONGEST_NAME = 34
+"""Letters of a policy that stand beside an axis."""
 _BEFORE_FALL_S = 0.6
 """What happens in this time before a fall does not set the scale [s]."""
 
@@ -84,7 +86,7 @@ def ladder(lines: Lines, reference: str) -> Chart:
         places.append(y)
         y += 1.0
     data: list[Spec] = []
-    layout = _layout(margin={"l": 8 * min(max(map(len, lines.titles)), 34) + 24, "r": 10, "t": 34, "b": 10})
+    layout = _layout(margin={"l": 8 * min(max(map(len, lines.titles)), _LONGEST_NAME) + 24, "r": 10, "t": 34, "b": 10})
     for number, column in enumerate(columns):
         estimates = [level(cell, column).scaled(column.scale) for _, _, cell in rungs]
         axis, known = _nth(number), [e for e in estimates if np.isfinite(e.value)]
@@ -105,7 +107,9 @@ def ladder(lines: Lines, reference: str) -> Chart:
             tickvals=_round_numbers(10 ** edge[0], 10 ** edge[1]), anchor="y",
         )  # fmt: skip
         layout[f"xaxis{axis}"]["ticktext"] = [f"{value:g}" for value in layout[f"xaxis{axis}"]["tickvals"]]
-    layout["yaxis"] = _axis(range=[y - 0.3, -0.7], tickvals=places, ticktext=[r[1] for r in rungs], showgrid=False)
+    layout["yaxis"] = _axis(
+        range=[y - 0.3, -0.7], tickvals=places, ticktext=[_short(r[1]) for r in rungs], showgrid=False
+    )
     layout["annotations"] = [
         _note(0.0, place, f"<b>{scenario}</b>", xref="paper", yref="y", xanchor="right", xshift=-8)
         for place, scenario in headings
@@ -179,7 +183,8 @@ def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:
     signals = lines.environment.curves
     longest = max((e.trace for cell in cells.values() for e in cell), key=lambda trace: len(trace["time_s"]))
     time = longest["time_s"]
-    stride = max(1, -(-len(time) // _POINTS))
+    points = min(_POINTS, max(_LEAST_POINTS, _ALL_POINTS // (len(lines.references) * len(lines.scenarios))))
+    stride = max(1, -(-len(time) // points))
     grid = {"x0": _digits(float(time[0])), "dx": _digits(float(stride * (time[1] - time[0])))}
     data: list[Spec] = []
     layout = _layout(margin={"l": 70, "r": 10, "t": 10, "b": 50})
@@ -237,10 +242,10 @@ def sweep(lines: Lines, points: Mapping[str, Mapping[float | None, list[Evaluati
         axis = _nth(len(columns))
         data += [_fall_marks(t, lines.colour[t], points[t], values, row, axis) for row, t in enumerate(failing)]
         layout[f"yaxis{axis}"] = _axis(
-            domain=[min(top + 0.02, 0.99), 1.0], tickvals=list(range(len(failing))), ticktext=failing, anchor="x",
+            domain=[min(top + 0.02, 0.99), 1.0], tickvals=list(range(len(failing))), ticktext=list(map(_short, failing)), anchor="x",
             range=[len(failing) - 0.4, -0.6], showgrid=False,
         )  # fmt: skip
-        layout["margin"]["l"] = max(76, 7.4 * min(max(map(len, failing)), 34) + 20)
+        layout["margin"]["l"] = max(76, 7.4 * min(max(map(len, failing)), _LONGEST_NAME) + 20)
     layout["xaxis"] = _axis(
         type="log", title=label, tickvals=values, ticktext=[f"{value:g}" for value in values],
         anchor=f"y{_nth(len(columns) - 1)}",
@@ -331,6 +336,11 @@ def number_interval(estimate: Estimate, column: Column) -> str:
 def _scope_of(row: Change, with_reference: bool) -> str:
     name = f"{row.reference} · {row.scope}" if with_reference else row.scope
     return f"<b>{name}</b>" if row.is_group else name
+
+
+def _short(name: str) -> str:
+    """The end of a name that is too long: of a path it is what differs."""
+    return name if len(name) <= _LONGEST_NAME else "…" + name[1 - _LONGEST_NAME :]
 
 
 def _symbol(row: Change) -> str:

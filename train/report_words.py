@@ -99,7 +99,7 @@ def in_short(results: Results) -> list[str]:
     """A line per residual and metric: in how many cells it is better, worse, or neither."""
     found = []
     for title in results.families:
-        rows = [row for row in results.changes if row.policy == title]
+        rows = [row for row in results.changes if row.policy == title and row.is_judged]
         for column in dict.fromkeys(row.column for row in rows):
             own = [row for row in rows if row.column == column]
             found += [
