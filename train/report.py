@@ -5,7 +5,8 @@ from pathlib import Path
 
 from elastic_env.errors import missing_extra
 from train.evaluate import Evaluation
-from train.report_charts import forest, ladder, learning, over_time, sweep
+from train.report_charts import forest, ladder
+from train.report_curves import learning, over_time, sweep
 from train.report_markdown import markdown
 from train.report_page import Page, changes_html, definitions, fold, table
 from train.report_words import SCORES, Results, capital, in_short, notes, scores, what
