@@ -104,7 +104,7 @@ def in_short(results: Results) -> list[str]:
             own = [row for row in rows if row.column == column]
             found += [
                 f"{title} against {row.base}, {column.title}, pooled over {row.scope}{_at(results, row)}: "
-                f"{percent_interval(row.relative)}{marked(row)}: {row.sentence}."
+                f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
                 for row in own
                 if row.is_group
             ]
@@ -116,6 +116,12 @@ def in_short(results: Results) -> list[str]:
             where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
             found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
     return found or ["No residual takes part: there are no training seeds, and differences are differences of means."]
+
+
+def _besides(row: Change) -> str:
+    """What the figures themselves do not say."""
+    is_plain = row.verdict in ("lower", "higher") and ";" not in row.sentence
+    return "" if is_plain else f": {row.sentence}"
 
 
 def _tally(cells: Sequence[Change]) -> str:
