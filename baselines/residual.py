@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError, field_validator
+from pydantic import field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -209,9 +209,11 @@ def read_description(folder: Path) -> ResidualDescription:
         ) from None
     except ValueError as error:
         raise ConfigurationError(f"{folder / DESCRIPTION} is not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{folder / DESCRIPTION} must be a mapping, got {type(content).__name__}")
     try:
-        return ResidualDescription.model_validate(content)
-    except ValidationError as error:
+        return ResidualDescription(**content)
+    except ConfigurationError as error:
         raise ConfigurationError(f"{folder / DESCRIPTION} describes no residual: {error}") from None
 
 
