@@ -29,7 +29,7 @@ def markdown(results: Results) -> str:
 
 
 def _changes_markdown(rows: Sequence[Change], swept: Sequence[str]) -> str:
-    head = ["policy", "base", "reference", "scenario", *swept, "metric", "base →", "change", "better than base",
+    head = ["policy", "base", "reference", "scenario", *swept, "metric", "base → policy", "change", "better than base",
             "falls (base)", "what it shows"]  # fmt: skip
     lines = []
     for row in (row for line in by_line(rows) for row in line):

@@ -79,7 +79,7 @@ def what(results: Results) -> list[tuple[str, str]]:
         ("policies", ", ".join(lines.titles)),
         (f"{quantity}s", ", ".join(lines.references)),
         ("scenarios", ", ".join(lines.scenarios)),
-        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {min(seeds)} to {max(seeds)}"),
+        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"),
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]
