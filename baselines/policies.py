@@ -13,7 +13,7 @@ from baselines.compensators import DynamicCompensator, GravityCompensator, Outpu
 from baselines.gravity_torque import GravityMethod
 from baselines.oracle import Oracle
 from baselines.policy import Policy, Zero
-from baselines.residual import read_description, residual_policy
+from baselines.residual import RESIDUAL, read_description, residual_policy
 from baselines.walking_controller import WalkingController, WalkingGains
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
@@ -105,10 +105,6 @@ _ON_THE_WALKER: dict[str, tuple[Builder, tuple[str, ...]]] = {
     "oracle": (_oracle, (*_CONTROLLER, "ramp_s")),
 }
 """The same. The controller alone assumes K too, for the ankles' offsets and the friction."""
-
-
-RESIDUAL = "residual:"
-"""Before the folder of a trained residual."""
 
 
 def policy_names() -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
+from pydantic import field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -20,6 +20,8 @@ from elastic_env.config import Model
 from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array
 
+RESIDUAL = "residual:"
+"""Before the folder of a trained residual, where policies are named."""
 DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
 _SHIPPED = Path(__file__).parent / "trained"
 
@@ -46,6 +48,22 @@ class ResidualDescription(Model):
     """Bound of normalised features, in standard deviations."""
     training: dict[str, Any] = {}
     """How it was trained: configuration, seed, versions, commit."""
+
+    @field_validator("base")
+    @classmethod
+    def _base_is_no_residual(cls, value: str) -> str:
+        return require_plain_base(value)
+
+
+def require_plain_base(name: str) -> str:
+    """The name of a base policy.
+
+    Raises:
+        ValueError: It is itself a residual, which could name another, or itself.
+    """
+    if name.startswith(RESIDUAL):
+        raise ValueError(f"the base of a residual must be no residual itself, got {name!r}; name a baseline")
+    return name
 
 
 class Network:
@@ -205,9 +223,11 @@ def read_description(folder: Path) -> ResidualDescription:
         ) from None
     except ValueError as error:
         raise ConfigurationError(f"{folder / DESCRIPTION} is not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{folder / DESCRIPTION} must be a mapping, got {type(content).__name__}")
     try:
-        return ResidualDescription.model_validate(content)
-    except ValidationError as error:
+        return ResidualDescription(**content)
+    except ConfigurationError as error:
         raise ConfigurationError(f"{folder / DESCRIPTION} describes no residual: {error}") from None
 
 

@@ -427,7 +427,8 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
     with pytest.raises(ConfigurationError, match=r"no residual at .*residual\.json"):
         baselines.make(f"residual:{tmp_path}", env)
     path = folder(tmp_path / "r")
-    for text, message in (("{", "is not JSON"), (json.dumps({"robot": "testbed"}), "base")):
+    silent = json.dumps({"robot": "testbed"})
+    for text, message in (("{", "is not JSON"), ("[]", "must be a mapping, got list"), (silent, "base")):
         (path / "residual.json").write_text(text)
         with pytest.raises(ConfigurationError, match=message):
             baselines.make(f"residual:{path}", env)

@@ -403,6 +403,7 @@ CONFIGURATIONS: dict[str, tuple[Any, list[str]]] = {
     "environment option": ({"name": "c", "env_options": {"stifness": 3}}, ["'stifness'", "stiffness", "pendulum"]),
     "no name": ({"policies": ["input"]}, ["name"]),
     "no policies": ({"name": "c", "policies": []}, ["policies"]),
+    "twice": ({"name": "c", "policies": ["input", "input"]}, ["two policies", "'input'", "label"]),
     "no references": ({"name": "c", "references": []}, ["references"]),
     "no scenarios": ({"name": "c", "scenarios": []}, ["scenarios"]),
     "negative": ({"name": "c", "episodes": -1}, ["episodes", ">= 1", "-1"]),
@@ -543,7 +544,7 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
         (["evaluate", "--help"], ["a list of one per joint", "twelve on the walker", "identification.json"]),
         (["play", "--help"], ["walker", "--reference", ".mp4"]),
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
-        (["compare", "--help"], ["configs/", "episodes.csv", "--jobs"]),
+        (["compare", "--help"], ["configs/", "episodes.csv", "report.html", "residual:PATH", "--jobs"]),
         (["identify", "--help"], ["--second-mass", "N·m/rad", "identification.json"]),
     ],
 )
@@ -706,7 +707,8 @@ def _write_and_fail(path: Path) -> None:
 
 def test_interrupting_a_comparison_ends_its_workers_at_once(tmp_path: Path) -> None:
     """Catches Ctrl-C that is ignored until all is done, and workers that go on without their parent."""
-    (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": ["zero", "input"] * 3}))
+    policies = [{"name": name, "label": f"{name} {n}"} for n in range(3) for name in ("zero", "input")]
+    (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": policies}))
     process = subprocess.Popen(
         [sys.executable, "-c", "from train.cli import main; main()", "compare", "long.yaml"],
         cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,

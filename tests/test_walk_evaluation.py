@@ -380,8 +380,9 @@ def test_trainings_that_come_with_it_are_valid(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", COMPARISONS, ids=lambda path: path.stem)
-def test_configurations_that_come_with_it_are_valid(path: Path) -> None:
+def test_configurations_that_come_with_it_are_valid(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a name or a duration that does not exist: all policies in the first cell, all cells of the first."""
+    monkeypatch.chdir(Path(__file__).parents[1])  # where the paths of residuals begin
     config = load_yaml(path, CompareConfig)
     cells = config.conditions()
     assert config.name == path.stem
@@ -431,7 +432,8 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     main(["compare", "walks.yaml"])
     assert drawn == [["input", "rigid"]] * 2
     stem = "0.3+0.5+0.3_s_num_steps=1_ideal.png"
-    files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"}
+    reports = {"statistics.csv", "report.html", "report.md"}
+    files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"} | reports
     folder = Path("runs/walks")
     assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json"}
     printed = capsys.readouterr().out

@@ -99,19 +99,25 @@ class Evaluate:
                 scenarios=[self.scenario], policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes, seed=self.seed,
             )  # fmt: skip
-        _print_files(compare(config, _CONSOLE, self.output))
+        _print_files(compare(config, _CONSOLE, self.output, report=False))
 
 
 @dataclass
 class Compare:
     """Compare policies × scenarios × references × seeds as a configuration says.
 
-    Writes episodes.csv (one row per episode), summary.md and figures beside the resolved configuration, seed, versions
-    and commit.
+    Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts and tables, works
+    offline), report.md, summary.md and figures beside the resolved configuration, seed, versions and commit.
+
+    A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all training seeds of a
+    residual, compared with their base on the same episodes, with intervals over training seeds. The base is added if
+    it is not among the policies.
 
     Example, one joint: elastic compare configs/testbed.yaml
 
     Example, the paper's walks: elastic compare configs/paper.yaml
+
+    Example, trained residuals: elastic compare configs/learned_testbed.yaml
     """
 
     config: Annotated[Path, tyro.conf.Positional]

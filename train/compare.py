@@ -11,10 +11,15 @@ from rich.console import Console
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from train import plots
+from train.changes import changes, merged
+from train.changes_tables import print_changes, write_statistics
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import Environment, Reference, environment
 from train.evaluate import Evaluation, make_policy, make_vector_env
+from train.families import expand
 from train.figures import draw_figures
+from train.report import require_plotly, write_report
+from train.report_words import Results
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
 from train.workers import run_conditions
@@ -53,6 +58,8 @@ class CompareConfig(Model):
     """Policies that the time series show, by label or name; all if empty."""
     sweep: Sweep | None = None
     """An option of the policies to vary."""
+    groups: dict[str, list[str]] = {}
+    """Scenarios that paired changes are also pooled over, by the name of the group."""
 
     @model_validator(mode="before")
     @classmethod
@@ -71,6 +78,9 @@ class CompareConfig(Model):
     def _names_exist(self) -> Self:
         environment(self.env)
         titles = [policy.title for policy in self.policies]
+        for title in titles:
+            if titles.count(title) > 1:
+                raise ConfigurationError(f"two policies are called {title!r}; give one of them a label")
         for title in self.figure_policies:
             if title not in titles:
                 raise unknown_name("policy of the figures", title, titles)
@@ -79,20 +89,37 @@ class CompareConfig(Model):
                 raise unknown_name("scenario with episodes of its own", scenario, self.scenarios)
             if episodes < 1:
                 raise ConfigurationError(f"scenario_episodes of {scenario!r} must be >= 1, got {episodes}")
+        for name, scenarios in self.groups.items():
+            if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
+                raise ConfigurationError(
+                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; got {scenarios}"
+                )
+            for scenario in scenarios:
+                if scenario not in self.scenarios:
+                    raise unknown_name(f"scenario of the group {name!r}", scenario, self.scenarios)
         return self
 
-    def conditions(self) -> list[Condition]:
-        """All cells, in the order reference, scenario, policy, swept value."""
+    def conditions(self, with_bases: bool = True) -> list[Condition]:
+        """All cells, in the order reference, scenario, policy, training seed, swept value.
+
+        Args:
+            with_bases: Whether a residual's base that is not among the policies plays too.
+
+        Raises:
+            ConfigurationError: Residuals that do not exist, or are no family.
+        """
+        entrants = expand(self.policies, with_bases)
         return [
             Condition(
-                env=self.env, policy=policy, reference=reference, label=label, scenario=scenario, swept=swept,
+                env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
+                scenario=scenario, swept=swept,
                 env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
             for reference, label in zip(self.references, self._reference_labels(), strict=True)
             for scenario in self.scenarios
-            for policy in self.policies
-            for swept in self._swept(policy)
+            for entrant in entrants
+            for swept in self._swept(entrant.policy)
         ]  # fmt: skip
 
     def _swept(self, policy: PolicySpec) -> list[dict[str, float]]:
@@ -119,14 +146,18 @@ class Comparison:
     files: list[Path]
 
 
-def compare(config: CompareConfig, console: Console, output: Path | None = None, jobs: int = 0) -> Comparison:
-    """Run a comparison, write its folder, and print its table.
+def compare(
+    config: CompareConfig, console: Console, output: Path | None = None, jobs: int = 0, report: bool = True
+) -> Comparison:
+    """Run a comparison, write its folder, and print its tables.
 
     Args:
         config: What to compare.
         console: Where progress and table go.
         output: Folder for the results; default runs/<name>, numbered if taken.
         jobs: Conditions to run at the same time, 0 for one per core.
+        report: Whether policies are compared with one another, and bases of residuals added for it; else they are
+            scored alone.
 
     Raises:
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
@@ -135,15 +166,23 @@ def compare(config: CompareConfig, console: Console, output: Path | None = None,
     if jobs < 0:
         raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {jobs}")
     plots.require_matplotlib()
-    conditions = config.conditions()
+    if report:
+        require_plotly()
+    conditions = config.conditions(with_bases=report)
     try_out(conditions)
     with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:
         evaluations = run_conditions(conditions, console, jobs)
         files = [write_episodes(evaluations, folder / "episodes.csv")]
-        files.append(write_summary(evaluations, folder / "summary.md"))
+        cells = merged(evaluations)
+        files.append(write_summary(cells, folder / "summary.md"))
         axis = None if config.sweep is None else config.sweep.label or config.sweep.option
-        files += draw_figures(evaluations, folder, config.figure_policies, axis)
-    print_summary(evaluations, console)
+        files += draw_figures(cells, folder, config.figure_policies, axis)
+        rows = changes(evaluations, config.groups) if report else []
+        if report:
+            files.append(write_statistics(rows, folder / "statistics.csv"))
+            files += write_report(Results(config.name, evaluations, rows, folder, axis))
+    print_summary(cells, console)
+    print_changes(rows, console)
     return Comparison(folder, evaluations, files)
 
 

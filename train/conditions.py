@@ -56,11 +56,24 @@ class PolicySpec(Model):
         return self.label or self.name
 
 
+class Member(Model):
+    """A training seed of a residual, in a comparison that may have more of them."""
+
+    folder: str
+    """Folder of the residual."""
+    training_seed: int | None = None
+    """Seed that it was trained with; None where nothing says it."""
+    base: str
+    """Title of the policy that it corrects."""
+
+
 class Condition(Model):
     """One cell of a comparison: who plays what under which scenario."""
 
     env: str = "testbed"
     policy: PolicySpec
+    member: Member | None = None
+    """Of a residual: which training seed the policy is, and what it corrects."""
     reference: Motion = "hold"
     """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
     or a mapping with `step_period` and further arguments of the environment."""

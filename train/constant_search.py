@@ -16,7 +16,7 @@ from cmaes import CMA
 from baselines.residual import ResidualDescription
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.signals import Array
-from train.progress import Progress
+from train.scores import Scores
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
@@ -70,30 +70,30 @@ class ConstantSearch:
         self._told: list[list[float]] = []
         self.done = 0
         folder.mkdir(parents=True, exist_ok=True)
-        self._progress = Progress(config, seed, folder, threads)
+        self._scores = Scores(config, seed, folder, threads)
         if (folder / _CHECKPOINT).exists():
             self._resume()
-        self._progress.forget_after(self.done)
+        self._scores.forget_after(self.done)
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
         """Search to the end of the configuration's decisions; `progress` is told the decisions done."""
         config = self.config
         if self.done == 0:
-            self._progress.evaluate(self.done, self._policy())
+            self._scores.evaluate(self.done, self._policy())
         while self.done < config.decisions:
             before, candidates = self.done, self._ask()
             self._tell(candidates, self._play(candidates))
             if config.is_due(config.evaluate_every, before, self.done):
-                self._progress.evaluate(self.done, self._policy())
+                self._scores.evaluate(self.done, self._policy())
             if config.is_due(config.checkpoint_every, before, self.done):
                 self.checkpoint()
             if progress is not None:
                 progress(self.done)
-        self._progress.keep("last", self.done, self._policy())
+        self._scores.keep("last", self.done, self._policy())
 
     def checkpoint(self) -> None:
         """Keep what the search was told: from its seed and that, its state follows."""
-        best = float(self._progress.best) if np.isfinite(self._progress.best) else None
+        best = float(self._scores.best) if np.isfinite(self._scores.best) else None
         fresh = self.folder / f"{_CHECKPOINT}.new"
         with fresh.open("w", encoding="utf-8") as file:
             json.dump({"decisions": self.done, "best": best, "told": self._told}, file)
@@ -106,7 +106,7 @@ class ConstantSearch:
         for costs in state["told"]:
             self._tell(self._ask(), np.array(costs))
         self.done = state["decisions"]
-        self._progress.best = np.inf if state["best"] is None else state["best"]
+        self._scores.best = np.inf if state["best"] is None else state["best"]
 
     def _ask(self) -> Array:
         """Candidates of a generation, (population, constants)."""

@@ -55,6 +55,30 @@ class Column:
 
 
 @dataclass(frozen=True)
+class Signal:
+    """A traced signal in charts over time.
+
+    Attributes:
+        title: Words for it.
+        name: Its name in the trace.
+        unit: Unit in which it is shown.
+        scale: Factor from SI to that unit.
+        reference: Name of what it should be in the trace; None where that is zero.
+    """
+
+    title: str
+    name: str
+    unit: str
+    scale: float
+    reference: str | None = None
+
+    @property
+    def label(self) -> str:
+        """Title with unit."""
+        return f"{self.title} [{self.unit}]"
+
+
+@dataclass(frozen=True)
 class Environment:
     """An environment as the commands see it.
 
@@ -75,6 +99,8 @@ class Environment:
         swept: Columns drawn against a swept value.
         learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.
         judged: Columns that policies are compared by, pair by pair.
+        also: Columns whose paired changes stand in the tables too.
+        curves: Signals over time in the report.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
     """
@@ -93,6 +119,8 @@ class Environment:
     overview: Column
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
+    curves: tuple[Signal, ...]
+    also: tuple[Column, ...] = ()
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     learned_from: dict[str, Any] = field(default_factory=dict)
     quantity: str = ""
@@ -178,6 +206,10 @@ _TESTBED = Environment(
     overview=Column("link error rms", "link_error_rms_rad"),
     swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
     judged=(Column("link error rms", "link_error_rms_rad"),),
+    curves=(
+        Signal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
+        Signal("link error", "link_error", "mrad", 1e3),
+    ),
 )  # fmt: skip
 
 _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
@@ -224,6 +256,12 @@ _WALKER = Environment(
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
     judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
     learned_from={"bank": 1},
+    also=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
+    curves=(
+        Signal("pelvis roll", "pelvis_roll", "mrad", 1e3),
+        Signal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
+        Signal("ZMP to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+    ),
     quantity="step period",
     failure="falls",
 )  # fmt: skip

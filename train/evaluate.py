@@ -173,8 +173,12 @@ def _record(
     condition: Condition, episode: int, info: dict[str, Any], world: int, estimates: "_Estimates | None"
 ) -> dict[str, Any]:
     metrics = {name: values[world].item() for name, values in info["episode_metrics"].items()}
+    member = condition.member
+    seed = None if member is None else member.training_seed
     return {
         "policy": condition.policy.title,
+        "training_seed": "" if seed is None else seed,
+        "base": "" if member is None else member.base,
         "scenario": condition.scenario,
         "reference": condition.reference_name,
         **condition.environment.abscissa(condition.reference),

@@ -23,8 +23,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from baselines.residual import ResidualDescription
 from train.algorithms import algorithm_class
 from train.export import network_of
-from train.progress import Progress
 from train.sb3_env import SB3VecEnv
+from train.scores import Scores
 from train.state import capture, read_state, restore, write_state
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
 
@@ -71,11 +71,11 @@ class Training:
         self._learning_rate = float(self.model.lr_schedule(1.0))
         self._shrink_last_layer()
         self.model.action_space.seed(seed)
-        self._progress = Progress(config, seed, folder, threads)
+        self._scores = Scores(config, seed, folder, threads)
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
             self._resume()
-        self._progress.forget_after(self.done)
+        self._scores.forget_after(self.done)
 
     @property
     def done(self) -> int:
@@ -99,7 +99,7 @@ class Training:
                 self.checkpoint()
             if progress is not None:
                 progress(self.done)
-        self._progress.keep("last", self.done, self._policy())
+        self._scores.keep("last", self.done, self._policy())
 
     def checkpoint(self) -> None:
         """Keep everything that the rest of the training depends on; a kill between its steps loses nothing."""
@@ -158,7 +158,7 @@ class Training:
             "decisions": model.num_timesteps,
             "updates": model._n_updates,
             "episodes": model._episode_num,
-            "best": float(self._progress.best) if np.isfinite(self._progress.best) else None,
+            "best": float(self._scores.best) if np.isfinite(self._scores.best) else None,
             "observation": model._last_obs,
             "original": model._last_original_obs,
             "starts": model._last_episode_starts,
@@ -183,7 +183,7 @@ class Training:
         model, normaliser = self.model, self._normaliser
         model.num_timesteps, model._n_updates = state["decisions"], state["updates"]
         model._episode_num = state["episodes"]
-        self._progress.best = np.inf if state["best"] is None else state["best"]
+        self._scores.best = np.inf if state["best"] is None else state["best"]
         model._last_obs, model._last_original_obs = state["observation"], state["original"]
         model._last_episode_starts = state["starts"]
         rms: Any
@@ -232,7 +232,7 @@ class Training:
     def _evaluate(self) -> None:
         """Score the present policy, without a trace in the random states of the training."""
         states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
-        self._progress.evaluate(self.done, self._policy())
+        self._scores.evaluate(self.done, self._policy())
         torch.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])

@@ -25,6 +25,8 @@ _COLOURS = {
     "dynamic": "#7aa344",
     "oracle": "#8e5ea2",
 }
+_STRONG = ("#d6006c", "#e69500", "#3d3df5", "#00a63e", "#111111", "#00a5cf", "#a05a00", "#8a8a8a")
+"""Of residuals and of one's own policies in the report: far from the baselines' and from one another."""
 FAILED = "#111111"
 """Colour of the mark of a failure that belongs to no policy alone."""
 _OTHERS = ("#bc8034", "#3d8b8b", "#8d5524", "#d1495b", "#4a4e69")
@@ -65,6 +67,12 @@ def require_matplotlib() -> Any:
 def colour(policy: str, index: int = 0) -> str:
     """Colour of a policy, the same in every figure."""
     return _COLOURS.get(policy, _OTHERS[index % len(_OTHERS)])
+
+
+def colours(policies: Sequence[str]) -> dict[str, str]:
+    """A colour for every policy of a comparison: those that have none of their own take the others in turn."""
+    unnamed = [policy for policy in policies if policy not in _COLOURS]
+    return {policy: _COLOURS.get(policy) or _STRONG[unnamed.index(policy) % len(_STRONG)] for policy in policies}
 
 
 def line_style(policy: str) -> str:

@@ -3,11 +3,11 @@
 from typing import Annotated, Any
 
 from gymnasium.vector import AutoresetMode
-from pydantic import Field
+from pydantic import Field, field_validator
 
 import baselines
 from baselines.correction import ResidualSettings
-from baselines.residual import ResidualDescription
+from baselines.residual import ResidualDescription, require_plain_base
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError
 from train.conditions import Condition, Motion, PolicySpec
@@ -53,6 +53,8 @@ class TrainConfig(Model):
     evaluate_every: int = quantity("1", 20_000, ge=1, description="decisions between evaluations")
     evaluation_episodes: int = quantity("1", 4, ge=1, description="episodes per scenario in an evaluation")
     checkpoint_every: int = quantity("1", 10_000, ge=1, description="decisions between checkpoints")
+
+    _checked = field_validator("base")(require_plain_base)
 
     @property
     def motion(self) -> Any:

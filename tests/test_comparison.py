@@ -1,0 +1,538 @@
+"""Families of residuals, statistics over training seeds, paired changes with their sentences, and the report."""
+
+import csv
+import itertools
+import json
+import re
+import shutil
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+import train.compare
+from baselines.residual import ResidualDescription, read_description
+from elastic_env.config import load_yaml
+from elastic_env.errors import ConfigurationError, MissingExtraError
+from train.changes import CEILING, Change, changes, level, merged, percent_interval
+from train.changes_tables import changes_table, write_statistics
+from train.cli import main
+from train.compare import CompareConfig
+from train.conditions import Condition, Member, PolicySpec
+from train.evaluate import Evaluation, evaluate
+from train.families import expand
+from train.progress import learning_curves
+from train.report import require_plotly, write_report
+from train.report_words import Results
+from train.runs import run_folder
+from train.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
+
+SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
+SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
+METRIC = "pelvis_error_rms_rad"
+POSITIVE = st.floats(1e-3, 1e3)
+
+
+def records(values: Sequence[float | None], first: int = 0) -> list[dict[str, Any]]:
+    """Episodes with one metric; None is a fall, with a figure that must not count."""
+    return [
+        {"seed": first + i, "termination": "" if value is not None else "fell", METRIC: 9.0 if value is None else value}
+        for i, value in enumerate(values)
+    ]
+
+
+def pairs(mine: Sequence[float], base: Sequence[float]) -> Pairs:
+    """Pairs of figures."""
+    return Pairs(np.array(mine), np.array(base))
+
+
+# Figures over training seeds.
+
+
+def test_interquartile_mean_of_known_numbers() -> None:
+    """Catches a mean of all, a median, and a cut that rounds up: of ten seeds two go at each end, of five one."""
+    assert interquartile_mean(np.array([100.0, 1.0, 2.0, 3.0, -50.0])) == 2.0
+    assert interquartile_mean(np.array([0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 99.0, 99.0])) == 3.5
+    assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(-1.0, 5.0), min_size=2, max_size=10))
+def test_interval_repeats_and_does_not_know_the_order_of_the_seeds(values: list[float]) -> None:
+    """Catches an interval that changes from run to run or with the order of the files, or that is extrapolated."""
+    first = over_seeds(values)
+    assert over_seeds(values[::-1]) == first
+    assert first.low is not None
+    assert first.high is not None
+    assert min(values) - 1e-9 <= first.low <= first.high <= max(values) + 1e-9
+
+
+def test_interval_of_two_seeds_is_that_of_all_resamples() -> None:
+    """Catches a wrong level: of two seeds a quarter of the resamples is twice the lower, so the ends are the seeds."""
+    assert over_seeds([0.2, 0.4]) == Estimate(pytest.approx(0.3), 0.2, 0.4)  # type: ignore[arg-type]
+
+
+def test_interval_agrees_with_the_distribution_of_all_resamples() -> None:
+    """Catches resampling without replacement, or of the trimmed values: all 4⁴ resamples are listed here."""
+    values = [1.0, 2.0, 4.0, 8.0]
+    every = [interquartile_mean(np.array(some)) for some in itertools.product(values, repeat=4)]
+    found = over_seeds(values)
+    assert (found.low, found.high) == tuple(np.quantile(every, [0.025, 0.975], method="nearest"))
+
+
+def test_one_training_seed_has_no_interval() -> None:
+    """Catches an interval over episodes in the place of one over training seeds."""
+    assert over_seeds([0.5]) == Estimate(0.5)
+    assert not over_seeds([0.5, float("nan")]).has_interval
+    assert np.isnan(over_seeds([]).value)
+    assert not improvement([[pairs([1.0, 2.0, 3.0], [2.0, 1.0, 4.0])]]).has_interval
+
+
+# Pairs.
+
+
+def test_pairs_are_found_by_the_seed_of_the_episode() -> None:
+    """Catches pairing by position: shuffled episodes belong together as before."""
+    mine, base = records([1.0, 2.0, 3.0]), records([10.0, 20.0, 30.0])
+    shuffled = pair([mine[2], mine[0], mine[1]], base, METRIC)
+    np.testing.assert_array_equal(shuffled.mine / shuffled.base, [0.1, 0.1, 0.1])
+    with pytest.raises(ValueError, match="seed of its own"):
+        pair([*mine, mine[0]], base, METRIC)
+
+
+def test_an_episode_in_which_either_fell_is_left_out_of_both() -> None:
+    """Catches a fall that is averaged in, and a base that is averaged over other episodes than the policy."""
+    found = pair(records([1.0, None, 3.0, 4.0]), records([2.0, 2.0, None, 8.0]), METRIC)
+    assert (found.mine.tolist(), found.base.tolist(), found.left_out) == ([1.0, 4.0], [2.0, 8.0], 2)
+    assert change([found]) == -0.5
+    only_here = pair(records([1.0, 2.0]), records([2.0, 4.0], first=1), METRIC)
+    assert (only_here.mine.tolist(), only_here.base.tolist(), only_here.left_out) == ([2.0], [2.0], 2)
+
+
+def test_change_pools_means_of_scenarios_and_not_episodes_or_ratios() -> None:
+    """Catches a scenario that weighs more because it has more episodes, and a mean of ratios."""
+    many, few = pairs([1.0] * 9, [2.0] * 9), pairs([9.0], [10.0])
+    assert change([many, few]) == pytest.approx((1.0 + 9.0) / (2.0 + 10.0) - 1.0)
+    assert np.isnan(change([many, pairs([], [])]))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(POSITIVE, POSITIVE), min_size=1, max_size=8), POSITIVE)
+def test_change_does_not_depend_on_the_unit(values: list[tuple[float, float]], unit: float) -> None:
+    """Catches a difference in the place of a ratio."""
+    mine, base = np.array(values).T
+    np.testing.assert_allclose(change([Pairs(unit * mine, unit * base)]), change([Pairs(mine, base)]), atol=1e-9)
+
+
+def test_probability_of_improvement_counts_all_pairs_of_seed_and_episode() -> None:
+    """Catches a share of seeds, larger taken for better, and ties that count as wins."""
+    seeds = [[pairs([1.0, 3.0], [2.0, 2.0])], [pairs([1.0, 2.0], [2.0, 2.0])], [pairs([1.0], [2.0])], [pairs([], [])]]
+    found = improvement(seeds)
+    assert found.value == pytest.approx((1 + 1.5 + 1) / 5)
+    assert found.low is not None
+    assert found.low == pytest.approx(0.5)
+    assert found.high == 1.0
+
+
+# Families.
+
+
+def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:
+    """A folder that says of itself what a residual does, without weights."""
+    config = {"scenarios": ["ideal", "soft"], "reference": 3, "seeds": [1, 2, 10], **values.pop("config", {})}
+    training = {"config": config} if seed is None else {"config": config, "seed": seed}
+    description = ResidualDescription(**{"robot": "walker", "base": "input_output", "training": training, **values})
+    folder.mkdir(parents=True)
+    (folder / "residual.json").write_text(description.model_dump_json())
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test works in a folder of its own, on a wide terminal without colours."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+
+FAMILY = PolicySpec(name="residual:run/seed_*/last", label="learned")
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_pattern_stands_for_all_training_seeds_in_natural_order_with_their_base(absolute: bool) -> None:
+    """Catches seed_10 before seed_2, a seed that is lost, and a family without what it is compared with."""
+    for seed in (10, 2, 1):
+        describe(Path(f"run/seed_{seed}/last"), seed if seed != 2 else None)  # one says it by its folder alone
+    (Path("run") / "seed_0.txt").write_text("no folder")
+    name = f"residual:{Path.cwd()}/run/seed_*/last" if absolute else FAMILY.name
+    found = expand([PolicySpec(name="zero"), FAMILY.replace(name=name)])
+    assert [entrant.policy.title for entrant in found] == ["zero", "input_output", "learned", "learned", "learned"]
+    members = [entrant.member for entrant in found if entrant.member is not None]
+    assert [member.training_seed for member in members] == [1, 2, 10]
+    assert {member.base for member in members} == {"input_output"}
+    assert [entrant.policy.name for entrant in found][2:] == [f"residual:{member.folder}" for member in members]
+    assert len(expand([FAMILY.replace(name=name)], with_bases=False)) == 3
+
+
+def test_a_base_is_the_policy_with_the_same_options() -> None:
+    """Catches a residual compared with another policy of the base's name, and a base that plays twice."""
+    describe(Path("one"), 1, base_options={"stiffness_scale": 0.9})
+    residual = PolicySpec(name="residual:one")
+    other, same = (
+        PolicySpec(name="input_output"),
+        PolicySpec(name="input_output", label="weak", options={"stiffness_scale": 0.9}),
+    )
+    assert [e.policy for e in expand([residual, same])][1:] == [same]
+    assert expand([residual, same])[0].member == Member(folder="one", training_seed=1, base="weak")
+    added = expand([other, residual])[1].policy
+    assert (added.title, added.options) == ("input_output (base of residual:one)", same.options)
+    given_anew = expand([residual.replace(options={"stiffness_scale": 0.5})])[0].policy
+    assert given_anew.options == {"stiffness_scale": 0.5}
+
+
+def test_folders_that_are_no_family_are_refused() -> None:
+    """Catches an interval over things that are not training seeds of one configuration."""
+    with pytest.raises(ConfigurationError, match=r"no folder matches 'run/seed_\*/last'"):
+        expand([FAMILY])
+    describe(Path("run/seed_1/last"), 1)
+    describe(Path("run/seed_2/last"), 1)
+    with pytest.raises(ConfigurationError, match="training seed 1 twice: run/seed_1/last and run/seed_2/last"):
+        expand([FAMILY])
+    shutil.rmtree("run/seed_2")
+    describe(Path("run/seed_2/last"), 2, base="input")
+    with pytest.raises(ConfigurationError, match="base of run/seed_2/last is 'input' and of run/seed_1/last 'input_o"):
+        expand([FAMILY])
+    shutil.rmtree("run/seed_2")
+    Path("run/seed_2/last").mkdir(parents=True)
+    with pytest.raises(ConfigurationError, match="no residual at run/seed_2/last"):
+        expand([FAMILY])
+
+
+def test_a_residual_on_a_residual_is_refused() -> None:
+    """Catches the endless recursion of a residual that names itself as its base."""
+    folder = describe(Path("loop"))
+    content = json.loads((folder / "residual.json").read_text())
+    (folder / "residual.json").write_text(json.dumps({**content, "base": "residual:loop"}))
+    with pytest.raises(ConfigurationError, match="must be no residual itself, got 'residual:loop'"):
+        read_description(folder)
+
+
+# Changes and their sentences.
+
+
+def cell(title: str, values: dict[str, Sequence[float | None]], scenario: str, member: Member | None = None,
+         reference: Any = 3, time: int = 400) -> Evaluation:  # fmt: skip
+    """A cell of the walker without physics: metrics, and a trace that any signal may be drawn from."""
+    spec = PolicySpec(name="zero" if member is None else f"residual:{member.folder}", label=title)
+    condition = Condition(env="walker", policy=spec, member=member, scenario=scenario, reference=reference)
+    episodes = [
+        {**record, "pelvis_error_rms_rad": value, "zmp_deviation_rms_m": value, "policy": title}
+        for key in values for record, value in zip(records(values[key]), values[key], strict=True)
+    ]  # fmt: skip
+    t = 0.004 * np.arange(time)
+    trace = {name: np.sin(t) for name in condition.environment.traced} | {
+        "time_s": t, "single_support": (t > 0.5).astype(float),
+    }  # fmt: skip
+    trace["zmp_y"] = np.where(t < 0.1, np.nan, trace["zmp_y"])
+    return Evaluation(condition, episodes, trace)
+
+
+def family(values: Sequence[Sequence[float | None]], scenario: str = "soft", **more: Any) -> list[Evaluation]:
+    """Cells of the training seeds of a residual, whose folders are made if they are not there."""
+    cells = []
+    for seed, own in enumerate(values):
+        folder = Path(f"seed_{seed}")
+        if not folder.exists():
+            describe(folder, seed)
+        member = Member(folder=str(folder), training_seed=seed, base="base")
+        cells.append(cell("learned", {"all": own}, scenario, member, **more))
+    return cells
+
+
+def only(rows: Sequence[Change], policy: str = "learned") -> Change:
+    """The first row of a policy."""
+    return next(row for row in rows if row.policy == policy)
+
+
+def test_change_of_a_family_is_paired_per_training_seed() -> None:
+    """Catches a mean over seeds before the ratio, the wrong base, and lost falls."""
+    base = cell("base", {"all": [2.0, 4.0, None]}, "soft")
+    other = cell("other", {"all": [3.0, 3.0, 3.0]}, "soft")
+    row = only(rows := changes([base, other, *family([[1.0, 2.0, 1.0], [1.0, 1.0, None], [None, 2.0, 1.0]])]))
+    np.testing.assert_allclose(row.per_seed, [-0.5, 2.0 / 6.0 - 1.0, -0.5])
+    assert (row.base, row.num_seeds, row.num_pairs) == ("base", 3, 5)
+    assert (row.falls, row.episodes, row.base_falls, row.base_episodes) == (2, 9, 1, 3)
+    assert row.falls_less
+    assert row.relative == over_seeds(row.per_seed.tolist())
+    against = only(rows, "other")
+    assert (against.base, against.is_family, against.relative) == ("base", False, Estimate(0.0))
+    assert "no training seeds" in against.sentence
+
+
+SENTENCES: dict[str, tuple[Sequence[Sequence[float | None]], str]] = {
+    "lower": ([[1.0, 1.0], [1.2, 1.0], [1.0, 1.2]], "47 % lower; fewer falls than base"),
+    "higher": ([[3.0, 3.0], [3.2, 3.0], [3.0, 3.2]], "53 % higher; fewer falls than base"),
+    "includes zero": ([[1.0, 1.0], [3.0, 3.0], [2.1, 2.1]], "the interval includes zero: no difference shown; fewer"),
+    "zero": ([[2.0, 2.0], [2.0, 2.0]], "the interval includes zero: no difference shown; fewer"),
+    "one seed": ([[1.0, 1.0]], "50 % lower with one training seed: no interval; fewer"),
+    "falls": ([[1.0, None, None], [1.0, None, None]], "50 % lower; MORE FALLS than base"),
+    "all fall": ([[None, None], [None, None]], "nothing to compare"),
+    "a seed falls": ([[1.0, 1.0], [None, None], [1.0, 1.0]], "50 % lower; 1 of 3 training seeds have nothing to"),
+}
+
+
+@pytest.mark.parametrize("case", SENTENCES)
+def test_every_row_says_what_it_shows(case: str) -> None:
+    """Catches a claim where the interval includes zero or is none, and falls that nobody hears of."""
+    values, sentence = SENTENCES[case]
+    base = cell("base", {"all": [2.0, 2.0, None]}, "soft")
+    assert only(changes([base, *family(values)])).sentence.startswith(sentence)
+
+
+def test_conditions_are_marked_by_what_training_has_seen() -> None:
+    """Catches a ceiling sold as a proof, and a held-out scenario, step period or group that is not called so."""
+    marks: list[tuple[str, Any, tuple[str, ...]]] = [
+        ("ideal", 3, (CEILING,)),
+        ("soft", {"step_period": 3, "num_steps": 2}, ()),
+        ("slope", 3, ("held out",)),
+        ("ideal", 1.6, ("held out step period",)),
+        ("slope", 1.6, ("held out scenario and step period",)),
+    ]
+    for scenario, reference, expected in marks:
+        base = cell("base", {"all": [2.0]}, scenario, reference=reference)
+        row = only(changes([base, *family([[1.0], [1.0]], scenario, reference=reference)]))
+        assert row.marks == expected
+    cells = [cell("base", {"all": [2.0]}, s) for s in ("ideal", "slope")]
+    learned = [e for s in ("ideal", "slope") for e in family([[1.0], [1.5]], s)]
+    rows = changes([*cells, *learned], {"both": ["ideal", "slope"]})
+    pooled = [row for row in rows if row.is_group and row.is_judged]
+    assert [row.marks for row in pooled] == [("held out: slope",)] * 2
+    np.testing.assert_allclose(pooled[0].per_seed, [-0.5, -0.25])
+
+
+def test_roll_and_pitch_stand_in_the_tables_and_do_not_judge() -> None:
+    """Catches figures that a reader of the walk looks for and does not find, and a verdict counted twice."""
+    base = cell("base", {"all": [2.0]}, "soft")
+    for e in (learned := family([[1.0]])) + [base]:
+        e.episodes[0]["pelvis_roll_rms_rad"] = 4.0 if e is base else 1.0
+    rows = {row.column.metric: row for row in changes([base, *learned]) if row.policy == "learned"}
+    assert [name for name, row in rows.items() if row.is_judged] == ["pelvis_error_rms_rad", "zmp_deviation_rms_m"]
+    assert rows["pelvis_roll_rms_rad"].relative.value == -0.75
+    assert "nothing to compare" in rows["pelvis_pitch_rms_rad"].sentence
+
+
+def test_a_residual_of_unknown_training_is_called_so() -> None:
+    """Catches a scenario taken for trained on because the files are silent."""
+    describe(Path("seed_0"), training={})
+    rows = changes([cell("base", {"all": [2.0]}, "ideal"), *family([[1.0]], "ideal")])
+    assert only(rows).marks == ("training condition unknown",)
+
+
+def test_a_swept_residual_is_compared_with_its_base_at_the_same_value() -> None:
+    """Catches a base at another stiffness, and a level that is left alone."""
+    evaluations = []
+    for value, base, mine in ((0.5, 4.0, 3.0), (1.0, 2.0, 1.0)):
+        for e, own in ((cell("base", {"all": [base]}, "ideal"), base), (*family([[mine]], "ideal"), mine)):
+            assert own
+            evaluations.append(Evaluation(e.condition.replace(swept={"stiffness_scale": value}), e.episodes, e.trace))
+    rows = [row for row in changes(evaluations) if row.policy == "learned" and row.column.metric == METRIC]
+    assert [(row.swept["stiffness_scale"], row.relative.value) for row in rows] == [(0.5, -0.25), (1.0, -0.5)]
+    assert rows[0].marks == ()
+
+
+def test_levels_and_merged_cells_keep_every_training_seed() -> None:
+    """Catches a family that shows its first seed alone: in the ladder, and in the summary."""
+    cells = family([[1.0, 3.0], [4.0, None], [6.0, 6.0]])
+    assert level(cells, cells[0].condition.environment.judged[0]).value == pytest.approx((2.0 + 4.0 + 6.0) / 3.0)
+    together = merged([cell("base", {"all": [2.0]}, "soft"), *cells])
+    assert [(e.condition.policy.title, len(e.episodes), e.num_failed) for e in together] == [
+        ("base", 1, 0), ("learned", 6, 1),
+    ]  # fmt: skip
+    assert [len(e.episodes) for e in cells] == [2, 2, 2]
+
+
+def test_percent_does_not_round_a_bound_to_zero() -> None:
+    """Catches an interval that seems to touch zero, or not to."""
+    assert percent_interval(Estimate(0.15, 0.003, 0.29)) == "+15.0 % [+0.3, +29.0]"
+    assert percent_interval(Estimate(-0.4, -0.45, -0.33)) == "−40 % [−45, −33]"
+
+
+# The report.
+
+_LOADS = re.compile(
+    r"<(?:script|link|img|iframe|source|object)\b[^>]*(?:src|href|data)\s*=|@import|url\(", re.IGNORECASE
+)
+
+
+def page_without_plotly(path: Path) -> str:
+    """A report's own text: plotly.js, which it must hold exactly once, is cut out."""
+    parts = path.read_text(encoding="utf-8").split(require_plotly())
+    assert len(parts) == 2
+    return "".join(parts)
+
+
+def report_of(evaluations: list[Evaluation], swept: str | None = None) -> str:
+    """Page of a comparison, without plotly.js."""
+    with run_folder("x", {}, 0) as folder:
+        results = Results("x", evaluations, changes(evaluations, {"both": ["soft", "ideal"]}), folder, swept)
+        write_report(results)
+    return page_without_plotly(folder / "report.html")
+
+
+def test_report_needs_nothing_from_outside_and_shows_every_part() -> None:
+    """Catches a page that is blank without a network, a chart that is no JSON, names that become markup."""
+    evil = "<script>alert(1)</script>"
+    evaluations = [
+        e
+        for reference in (3, 1.6, 1.1)
+        for scenario in ("soft", "ideal")
+        for e in [
+            cell("base", {"all": [2.0, 2.0]}, scenario, reference=reference),
+            cell(evil, {"all": [None, None]}, scenario, reference=reference, time=120),
+            *(cell(f"policy {n}", {"all": [n, n + 1.0]}, scenario, reference=reference) for n in range(1, 9)),
+            *family([[1.0, None], [1.5, 1.2]], scenario, reference=reference),
+        ]
+    ]
+    for seed in (0, 1):  # as in a training run
+        describe(Path(f"run/seed_{seed}/last"), seed)
+        shutil.rmtree(f"seed_{seed}")
+        Path(f"seed_{seed}").symlink_to(f"run/seed_{seed}/last")
+        Path(f"run/seed_{seed}/progress.csv").write_text(
+            "decisions,scenario,pelvis_error_rms_rad,zmp_deviation_rms_m,base_pelvis_error_rms_rad,"
+            "base_zmp_deviation_rms_m,failed,base_failed\n0,soft,2,2,2,2,0,0\n100,soft,1,nan,2,2,0,0\n"
+        )
+    page = report_of(evaluations)
+    assert _LOADS.search(page) is None
+    assert "http" not in page
+    assert evil not in page.replace(json.dumps(evil), "")
+    headings = re.findall(r"<h2 id=\"(s\d+)\">([^<]*)</h2>", page)
+    wanted = ["What was compared", "Ladder of policies", "Residuals against their base",
+              "Baselines against one another", "By phase, rms", "Curves over time", "Sweeps",
+              "Learning curves", "Notes"]  # fmt: skip
+    assert [title for _, title in headings] == wanted
+    assert all(f'href="#{anchor}"' in page for anchor, _ in headings)
+    specs = re.findall(r'<script type="application/json" id="(c\d+)-spec">(.*?)</script>', page)
+    assert len(specs) == 3 + 1 + 6 + 2 + 1
+    for name, spec in specs:
+        assert f'id="{name}"' in page
+        assert any(trace.get("x") or trace.get("y") for trace in json.loads(spec)["data"])
+    text = Path("runs/x/report.md").read_text()
+    assert all(f"## {title}" in text for title in ("In short", *wanted[2:5], "Notes"))
+
+
+def test_report_of_a_sweep_draws_curves_and_falls() -> None:
+    """Catches a sweep shown as one bar per value, and policies that fail unseen."""
+    evaluations = [
+        Evaluation(e.condition.replace(swept={"stiffness_scale": value}), e.episodes, e.trace)
+        for value in (0.5, 1.0, 2.0)
+        for e in [cell("base", {"all": [2.0, None if value > 1 else 2.0]}, "soft"), *family([[1.0, 1.5], [1.5, 1.2]])]
+    ]
+    page = report_of([*evaluations, cell("oracle", {"all": [0.5, 0.5]}, "soft")], "assumed over true stiffness")
+    assert "Ladder of policies" not in page
+    (spec,) = (json.loads(s) for s in re.findall(r'id="c\d+-spec">(.*?)</script>', page))
+    assert spec["layout"]["xaxis"]["title"]["text"] == "assumed over true stiffness"
+    bands = [trace for trace in spec["data"] if trace.get("fill") == "tonexty"]
+    assert [trace["legendgroup"] for trace in bands] == ["learned"] * 2
+    (crosses,) = [trace for trace in spec["data"] if trace["mode"] == "markers"]
+    assert (crosses["x"], crosses["marker"]["symbol"]) == ([2.0], ["x-open"])
+
+
+def test_learning_curves_are_shares_of_the_base_and_gaps_where_a_scenario_failed() -> None:
+    """Catches a mean over fewer scenarios where one fell, and curves of a policy that lies elsewhere."""
+    folder = describe(Path("run/seed_0/best"), 0)
+    columns = Condition(env="walker", policy=PolicySpec(name="zero")).environment.judged[:1]
+    assert learning_curves([str(folder)], columns) is None
+    Path("run/seed_0/progress.csv").write_text(
+        "decisions,scenario,pelvis_error_rms_rad,base_pelvis_error_rms_rad\n0,a,2,2\n0,b,4,4\n50,a,1,2\n50,b,1,4\n"
+        "100,a,1,2\n100,b,nan,4\n"
+    )
+    found = learning_curves([str(folder)], columns)
+    assert found is not None
+    assert found.decisions.tolist() == [0, 50, 100]
+    np.testing.assert_array_equal(found.ratios["pelvis_error_rms_rad"], [[1.0, 0.375, np.nan]])
+
+
+def test_without_plotly_the_comparison_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches minutes of work that end in an import error."""
+    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    with pytest.raises(MissingExtraError, match=r"report needs the package plotly; .*elastic-env\[report\]"):
+        require_plotly()
+
+
+# elastic compare with residuals.
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Folder of `elastic compare` with two shipped training seeds, played for real, and what it printed."""
+    root = tmp_path_factory.mktemp("families")
+    content = {
+        "name": "two", "references": [SINE], "scenarios": ["nominal"], "episodes": 2,
+        "policies": ["uncompensated", {"name": f"residual:{SHIPPED}/seed_[01]", "label": "learned"}],
+    }  # fmt: skip
+    (root / "two.yaml").write_text(yaml.safe_dump(content))
+
+    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+        return [evaluate(condition, num_threads=1) for condition in conditions]
+
+    with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
+        patch.chdir(root)
+        patch.setattr(train.compare, "run_conditions", run)
+        patch.setattr("train.cli._CONSOLE", Console(width=160, file=file))
+        main(["compare", "two.yaml"])
+    return root / "runs" / "two", (root / "printed.txt").read_text()
+
+
+def test_compare_plays_every_training_seed_and_the_base(compared: tuple[Path, str]) -> None:
+    """Catches rows that cannot be told apart, a base that is missing, and a statistic that the episodes do not bear."""
+    folder, printed = compared
+    with (folder / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["policy"], row["training_seed"], row["base"]) for row in rows} == {
+        ("uncompensated", "", ""), ("input", "", ""), ("learned", "0", "input"), ("learned", "1", "input"),
+    }  # fmt: skip
+    assert len(rows) == 4 * 2
+    mean = {
+        seed: np.mean([float(r["link_error_rms_rad"]) for r in rows if r["scenario"] == "nominal" and (
+            r["training_seed"] == seed and r["policy"] in ("learned", "input"))])
+        for seed in ("", "0", "1")
+    }  # fmt: skip
+    with (folder / "statistics.csv").open(newline="") as file:
+        found = next(row for row in csv.DictReader(file) if row["policy"] == "learned" and row["scope"] == "nominal")
+    expected = [mean[seed] / mean[""] - 1.0 for seed in ("0", "1")]
+    np.testing.assert_allclose([float(v) for v in found["change_per_training_seed"].split()], expected, rtol=1e-4)
+    assert float(found["change"]) == pytest.approx(np.mean(expected))
+    assert (found["base"], found["training_seeds"], found["pairs"]) == ("input", "2", "4")
+    assert found["marks"] == "held out reference"
+    assert "interquartile mean and 95 % interval over 2 training seeds" in " ".join(printed.split())
+    for name in ("report.html", "report.md", "statistics.csv"):
+        assert f"runs/two/{name}" in printed
+    assert load_yaml(folder / "config.yaml", CompareConfig).policies[1].name.endswith("seed_[01]")
+    page_without_plotly(folder / "report.html")
+
+
+def test_groups_name_scenarios_that_are_played() -> None:
+    """Catches a group that is silently smaller than it says, and one whose name is a scenario's."""
+    with pytest.raises(ConfigurationError, match="'sof'"):
+        CompareConfig(name="c", groups={"held out": ["sof"]})
+    with pytest.raises(ConfigurationError, match="'nominal' must have a name that no scenario has"):
+        CompareConfig(name="c", groups={"nominal": ["nominal"]})
+
+
+def test_tables_tell_falls_and_intervals_that_include_zero() -> None:
+    """Catches a table from which a reader takes more than the statistics bear."""
+    base = cell("base", {"all": [2.0, 2.0]}, "soft")
+    rows = changes([base, *family([[1.0, None], [3.0, 3.0], [2.1, 2.1]])])
+    console = Console(width=160, record=True, file=StringIO())
+    console.print(changes_table([row for row in rows if row.is_family]))
+    text = console.export_text()
+    assert "! 1/6 (0/2)" in text
+    assert re.search(r"\[−50, \+50\] \*", text)
+    content = write_statistics(rows, Path("statistics.csv")).read_text(encoding="utf-8")
+    assert "MORE FALLS than base" in content

@@ -1,0 +1,180 @@
+"""The report of a comparison: `report.html`, which works without a network, and its tables as Markdown."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from elastic_env.errors import missing_extra
+from train.evaluate import Evaluation
+from train.report_charts import forest, ladder
+from train.report_curves import learning, over_time, sweep
+from train.report_markdown import markdown
+from train.report_page import Page, changes_html, definitions, fold, table
+from train.report_words import SCORES, Results, capital, in_short, notes, scores, what
+
+MIN_SWEPT_REFERENCES = 3
+"""From so many references with a number of their own on, the scores are drawn against it."""
+_LONG = 40
+"""Rows from which on a table is folded away."""
+
+
+def require_plotly() -> str:
+    """The source of plotly.js, to be put into a page.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
+    """
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        raise missing_extra("plotly", "report", "writing a report") from None
+    return get_plotlyjs()
+
+
+def write_report(results: Results) -> list[Path]:
+    """Write `report.html` and `report.md` beside the other files of a comparison."""
+    page, text = results.folder / "report.html", results.folder / "report.md"
+    page.write_text(_page(results).html(require_plotly()), encoding="utf-8")
+    text.write_text(markdown(results), encoding="utf-8")
+    return [page, text]
+
+
+def _page(results: Results) -> Page:
+    known = results.lines.environment
+    page = Page(f"Comparison: {results.name}", f"{capital(known.subject)}; made {results.metadata['created'][:10]}")
+    page.section("What was compared")
+    page.add(definitions(what(results)))
+    page.bullets(in_short(results))
+    if results.swept is None:
+        _add_ladder(page, results)
+    _add_changes(page, results)
+    _add_phases(page, results)
+    if results.swept is None:
+        _add_curves(page, results)
+    _add_sweeps(page, results)
+    if results.learning:
+        page.section("Learning curves")
+        chart = learning(results.learning, known.judged, results.lines.colour)
+        page.text(
+            "Score over that of the base (dotted) on episodes that training never sees, mean over the trained "
+            "scenarios: median over training seeds, band from the best to the worst."
+        )
+        page.chart(chart)
+    page.section("Notes")
+    page.bullets(notes(results))
+    return page
+
+
+def _add_ladder(page: Page, results: Results) -> None:
+    page.section("Ladder of policies")
+    seeds = (
+        " Diamonds are residuals: interquartile mean over training seeds with its 95 % interval."
+        if results.families else ""
+    )  # fmt: skip
+    page.text(f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}")
+    references = results.lines.references
+    for number, reference in enumerate(references):
+        chart = ladder(results.lines, reference)
+        title = results.lines.environment.title(reference)
+        page.chart(chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
+
+
+def _add_changes(page: Page, results: Results) -> None:
+    """Forest charts and tables of residuals; baselines in a table of their own."""
+    trained = [row for row in results.changes if row.is_family]
+    others = [row for row in results.changes if not row.is_family]
+    colour, swept = results.lines.colour, results.swept_options
+    if trained:
+        page.section("Residuals against their base")
+        drawn = results.swept is None
+        marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
+        page.text(
+            "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below "
+            f"zero; red: above; grey: it includes zero, or there is none.{marks}"
+        )
+        for title in dict.fromkeys(row.policy for row in trained if drawn):
+            own = [row for row in trained if row.policy == title and row.is_judged]
+            page.heading(f"{title} against {own[0].base}")
+            page.chart(forest(own))
+        _add_table(page, "Table of changes", changes_html(trained, colour, swept), len(trained))
+    if others:
+        page.section("Baselines against one another")
+        page.text("Paired differences of means. Baselines are not trained: there are no training seeds to draw from.")
+        _add_table(page, "Table of differences", changes_html(others, colour, swept, False), len(others))
+
+
+def _add_table(page: Page, title: str, html: str, rows: int) -> None:
+    page.add(html if rows <= _LONG else fold(f"{title} ({rows} rows)", html))
+
+
+def _add_phases(page: Page, results: Results) -> None:
+    for title, columns in results.lines.environment.splits:
+        page.section(title)
+        page.text(SCORES)
+        head, rows = scores(results, columns)
+        _add_table(
+            page, f"Table ({len(rows)} rows)", table(head, rows, words=3 + len(results.swept_options)), len(rows)
+        )
+
+
+def _add_curves(page: Page, results: Results) -> None:
+    page.section("Curves over time")
+    band = " Of residuals: median over training seeds, band from the least to the most." if results.families else ""
+    shade = " Single support is shaded." if results.lines.environment.splits else ""
+    page.text(f"The first episode of every cell; a line ends where the episode does.{band}{shade}")
+    first = True
+    for reference in results.lines.references:
+        for scenario in results.lines.scenarios:
+            chart = over_time(results.lines, reference, scenario)
+            if chart is not None:
+                title = f"{results.lines.environment.title(reference)}, {scenario}"
+                page.chart(chart, folded=capital(title), is_open=first)
+                first = False
+
+
+def _add_sweeps(page: Page, results: Results) -> None:
+    """Scores over the swept option, or over what the references differ in."""
+    lines = results.lines
+    charts = []
+    if results.swept is not None:
+        for reference in lines.references:
+            for scenario in lines.scenarios:
+                points = {
+                    t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
+                }
+                charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
+    elif len({_number(e) for e in results.evaluations} - {None}) >= MIN_SWEPT_REFERENCES:
+        for scenario in lines.scenarios:
+            points = {t: _by_number(lines.cell(t, scenario=scenario)) for t in lines.titles}
+            charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
+    if not charts:
+        return
+    page.section("Sweeps")
+    page.text(
+        "Means over the episodes that reached the end. A cross on top: all episodes of a policy failed there; an "
+        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.families else "")
+    )
+    for number, (title, points, label) in enumerate(charts):
+        chart = sweep(lines, {t: own for t, own in points.items() if own}, label)
+        page.chart(chart, folded=capital(title), is_open=number == 0)
+
+
+def _by_option(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Evaluation]]:
+    found: dict[float | None, list[Evaluation]] = {}
+    for e in evaluations:
+        found.setdefault(next(iter(e.condition.swept.values()), None), []).append(e)
+    return found
+
+
+def _by_number(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Evaluation]]:
+    found: dict[float | None, list[Evaluation]] = {}
+    for e in evaluations:
+        number = _number(e)
+        if number is not None:
+            found.setdefault(number, []).append(e)
+    return found
+
+
+def _number(evaluation: Evaluation) -> float | None:
+    """What of a reference scores can be drawn against."""
+    condition = evaluation.condition
+    return next(iter(condition.environment.abscissa(condition.reference).values()), None)

@@ -1,0 +1,67 @@
+"""The tables and sentences of a report as Markdown."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from train.changes import Change, by_line, percent_interval
+from train.changes_tables import falls
+from train.report_words import SCORES, Results, in_short, marked, notes, scores, what
+
+
+def markdown(results: Results) -> str:
+    """A whole report."""
+    parts = [f"# Comparison: {results.name}", "\n".join(f"* {term}: {text}" for term, text in what(results))]
+    parts += ["## In short", "\n".join(f"* {line}" for line in in_short(results))]
+    for title, rows in (
+        ("Residuals against their base", [row for row in results.changes if row.is_family]),
+        ("Baselines against one another", [row for row in results.changes if not row.is_family]),
+    ):
+        if rows:
+            parts += [f"## {title}", _changes_markdown(rows, results.swept_options)]
+    for title, columns in results.lines.environment.splits:
+        head, rows = scores(results, columns)
+        parts += [f"## {title}", SCORES, _markdown_table(head, rows, words=3 + len(results.swept_options))]
+    if results.learning:
+        parts += ["## Learning curves", _learning_markdown(results)]
+    parts += ["## Notes", "\n".join(f"* {note}" for note in notes(results))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _changes_markdown(rows: Sequence[Change], swept: Sequence[str]) -> str:
+    head = ["policy", "base", "reference", "scenario", *swept, "metric", "base → policy", "change", "better than base",
+            "falls (base)", "what it shows"]  # fmt: skip
+    lines = []
+    for row in (row for line in by_line(rows) for row in line):
+        number = f".{row.column.decimals}f"
+        before, after = (f"{row.column.scale * value:{number}}" for value in (row.theirs, row.mine))
+        scope = ("pooled: " if row.is_group else "") + row.scope + marked(row)
+        lines.append(
+            [
+                row.policy, row.base, row.reference, scope,
+                *(f"{row.swept[name]:g}" if name in row.swept else "-" for name in swept), row.column.title,
+                f"{before} → {after} {row.column.unit}" if np.isfinite(row.mine) else "-",
+                percent_interval(row.relative), percent_interval(row.improvement, signed=False), falls(row),
+                row.sentence,
+            ]
+        )  # fmt: skip
+    return _markdown_table(head, lines, words=5 + len(swept), last_is_words=True)
+
+
+def _learning_markdown(results: Results) -> str:
+    head = ["residual", "metric", "decisions", "median", "best", "worst"]
+    rows = []
+    for title, curves in results.learning.items():
+        for column in results.lines.environment.judged:
+            for at, ratio in zip(curves.decisions, curves.ratios[column.metric].T, strict=True):
+                known = ratio[np.isfinite(ratio)]
+                values = (np.median(known), known.min(), known.max()) if len(known) else (np.nan,) * 3
+                rows.append([title, column.title, f"{at:.0f}", *(f"{value:.2f}" for value in values)])
+    return "Share of the base's score, over training seeds.\n\n" + _markdown_table(head, rows, words=2)
+
+
+def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int, last_is_words: bool = False) -> str:
+    last = len(head) - 1
+    rules = ["---" if i < words or (last_is_words and i == last) else "---:" for i in range(len(head))]
+    lines = [head, rules, *([text.replace("|", "\\|") for text in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,210 @@
+"""What a report says in words and tables, whatever it is written in: the results, what they are of, what to know."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from train.changes import CEILING, HELD_OUT, Change, by_cell, families, level, percent_interval
+from train.chart_parts import Lines, number_interval
+from train.environments import Column
+from train.evaluate import Evaluation
+from train.families import Origin
+from train.progress import Curves, learning_curves
+
+SCORES = (
+    "Mean over the episodes that reached the end; of residuals the interquartile mean over training seeds, with its "
+    "95 % interval."
+)
+"""What the tables of scores hold."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a report is about.
+
+    Attributes:
+        name: Name of the comparison.
+        evaluations: All cells, one per training seed.
+        changes: Paired changes.
+        folder: Where the comparison's files are, with its metadata.
+        swept: What the axis of a sweep says; None without one.
+    """
+
+    name: str
+    evaluations: list[Evaluation]
+    changes: list[Change]
+    folder: Path
+    swept: str | None = None
+
+    @cached_property
+    def families(self) -> dict[str, Origin]:
+        """Families of residuals and how they were trained."""
+        return families(self.evaluations)
+
+    @cached_property
+    def lines(self) -> Lines:
+        """Policies with their colours."""
+        return Lines(self.evaluations)
+
+    @cached_property
+    def learning(self) -> dict[str, Curves]:
+        """Learning curves of the families whose folders lie in a training run."""
+        columns = self.lines.environment.judged
+        found = {title: learning_curves(origin.folders, columns) for title, origin in self.families.items()}
+        return {title: curves for title, curves in found.items() if curves is not None}
+
+    @cached_property
+    def metadata(self) -> Mapping[str, Any]:
+        """Origin of the comparison: date, seed, commit, versions."""
+        return json.loads((self.folder / "metadata.json").read_text(encoding="utf-8"))
+
+    @property
+    def swept_options(self) -> list[str]:
+        """Names of the options that a sweep varies."""
+        return list(dict.fromkeys(name for row in self.changes for name in row.swept))
+
+
+def what(results: Results) -> list[tuple[str, str]]:
+    """What was compared, when and with what: terms and texts."""
+    lines, origin = results.lines, results.metadata
+    seeds = [episode["seed"] for e in results.evaluations for episode in e.episodes]
+    per_cell = sorted({len(e.episodes) for e in results.evaluations})
+    versions = ", ".join(f"{name} {version}" for name, version in origin["versions"].items() if version)
+    quantity = lines.environment.quantity or "reference"
+    each = " and training seed" if results.families else ""
+    found = [
+        ("policies", ", ".join(lines.titles)),
+        (f"{quantity}s", ", ".join(lines.references)),
+        ("scenarios", ", ".join(lines.scenarios)),
+        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"),
+        ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
+        ("versions", f"Python {origin['python']}, {versions}"),
+    ]
+    return found + [(title, _trained(origin)) for title, origin in results.families.items()]
+
+
+def _trained(origin: Origin) -> str:
+    number = len(origin.folders)
+    where = origin.folders[0] if number == 1 else f"{origin.folders[0]} to {origin.folders[-1]}"
+    on = "an unknown condition" if origin.scenarios is None else ", ".join(origin.scenarios)
+    motion = "" if origin.reference is None else f" ({origin.reference})"
+    seeds = f"{number} training seed{'s' * (number != 1)}"
+    return f"{seeds}, trained on {on}{motion}; {where}; commit {', '.join(commit[:12] for commit in origin.commits)}"
+
+
+def in_short(results: Results) -> list[str]:
+    """A line per residual and metric: in how many cells it is better, worse, or neither."""
+    found = []
+    for title in results.families:
+        rows = [row for row in results.changes if row.policy == title and row.is_judged]
+        for column in dict.fromkeys(row.column for row in rows):
+            own = [row for row in rows if row.column == column]
+            found += [
+                f"{title} against {row.base}, {column.title}, pooled over {row.scope}{_at(results, row)}: "
+                f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
+                for row in own
+                if row.is_group
+            ]
+            cells = [row for row in own if not row.is_group]
+            if cells:
+                found.append(f"{title} against {cells[0].base}, {column.title}: {_tally(cells)}.")
+        worse = [row for row in rows if row.falls_more and not row.is_group]
+        if worse:
+            where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
+            found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
+    return found or ["No residual takes part: there are no training seeds, and differences are differences of means."]
+
+
+def _besides(row: Change) -> str:
+    """What the figures themselves do not say."""
+    is_plain = row.verdict in ("lower", "higher") and ";" not in row.sentence
+    return "" if is_plain else f": {row.sentence}"
+
+
+def _tally(cells: Sequence[Change]) -> str:
+    counts = {
+        "lower": [row for row in cells if row.verdict == "lower"],
+        "higher": [row for row in cells if row.verdict == "higher"],
+        "no difference shown (the interval includes zero)": [row for row in cells if row.verdict == "none"],
+        "no interval": [row for row in cells if row.verdict == "unclear"],
+    }
+    parts = [f"{words} in {len(rows)}" for words, rows in counts.items() if rows]
+    return f"of {len(cells)} cells " + ", ".join(parts)
+
+
+def _at(results: Results, row: Change) -> str:
+    several = len(results.lines.references) > 1
+    swept = [f"{name}={value:g}" for name, value in row.swept.items()]
+    return "".join(f", {part}" for part in [*([row.reference] if several else []), *swept])
+
+
+def marked(row: Change) -> str:
+    """Marks of a row in brackets."""
+    return f" ({'; '.join(row.marks)})" if row.marks else ""
+
+
+def notes(results: Results) -> list[str]:
+    """What a reader needs to know, and only what concerns this comparison."""
+    failure = "falls" if results.lines.environment.failure == "falls" else "failures"
+    notes = [
+        "A change is, per training seed, the mean over episodes with the residual over the mean over the same "
+        "episodes of its base, minus one. An episode in which either did not reach the end is left out of both and "
+        f"counted under {failure}. Below zero is better.",
+    ]
+    if results.families:
+        notes.append(
+            "Figures of residuals are interquartile means over training seeds with 95 % percentile bootstrap "
+            "intervals over training seeds (never over the episodes of one). A base has no training seed, so it has no "
+            "interval. Pooled: means over scenarios are compared, per training seed."
+        )
+        notes.append(
+            "Better than base: share of all pairs of training seed and episode in which the residual is ahead, ties "
+            "as one half."
+        )
+    marks = {mark for row in results.changes for mark in row.marks}
+    if any(mark.startswith(HELD_OUT) for mark in marks):
+        notes.append(f"Marked {HELD_OUT!r}: nothing of this scenario, or of this motion, was seen in training.")
+    if CEILING in marks:
+        notes.append(
+            f"Marked {CEILING!r}: the scenario is deterministic and the residual was trained on it, so that training "
+            "and evaluation see the same. It says what is possible, not what is to be expected."
+        )
+    for title, origin in results.families.items():
+        if len(origin.folders) == 1:
+            notes.append(f"{title} is a single training seed: another one may come out differently.")
+        if origin.missing_seeds:
+            missing = ", ".join(map(str, origin.missing_seeds))
+            notes.append(f"{title} lacks training seeds of its configuration: {missing}.")
+    return notes
+
+
+def _span(numbers: Sequence[int]) -> str:
+    return str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
+
+
+def capital(text: str) -> str:
+    """With a capital at the beginning."""
+    return text[:1].upper() + text[1:]
+
+
+def scores(results: Results, columns: Sequence[Column]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of a table of scores."""
+    swept, lines = results.swept_options, results.lines
+    head = ["reference", "scenario", "policy", *swept, *(column.label for column in columns)]
+    rows = []
+    for reference in lines.references:
+        for scenario in lines.scenarios:
+            for title in lines.titles:
+                found = by_cell(lines.cell(title, reference_name=reference, scenario=scenario))
+                for cell in found.values():
+                    values = cell[0].condition.swept
+                    rows.append(
+                        [
+                            reference, scenario, title, *(f"{values[n]:g}" if n in values else "-" for n in swept),
+                            *(number_interval(level(cell, c).scaled(c.scale), c) for c in columns),
+                        ]
+                    )  # fmt: skip
+    return head, rows
