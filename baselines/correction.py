@@ -8,6 +8,7 @@ passed through a first-order low-pass. It acts in one of two spaces:
   encoder readings alike. Zero means that the model is right.
 """
 
+from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -16,8 +17,10 @@ from pydantic import model_validator
 from baselines.policy import Action, ObservationView, Policy, resume
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.robots.robot_model import RobotModel
+from elastic_env.robots.robot_model import RobotModel, WalkerModel
+from elastic_env.robots.thormang import SIDES
 from elastic_env.signals import Array, BoolArray, IntArray
+from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 
 Space = Literal["joint", "model"]
 
@@ -39,6 +42,9 @@ class ResidualSettings(Model):
     """Joints that are corrected, by the end of their names (ankle_roll means both); None for all."""
     observe_base_action: bool = False
     """Whether it sees what the base alone would command, beside the observation."""
+    observe_errors: bool = False
+    """Whether it sees differences to the plan too, which are small beside the observation: encoders less reference
+    angles, and on the walker the measured ZMP and load share less the planned ones."""
     history: int = quantity("1", 0, ge=0, description="measurements of earlier decisions that it sees as well")
 
     @model_validator(mode="after")
@@ -162,7 +168,9 @@ class Features:
         measured = [i for i, name in enumerate(table.names) if name.split(".")[0] in _MEASUREMENTS]
         self._measured, self._history = np.array(measured), settings.history
         action = len(corrected.model.joint_names) if settings.observe_base_action else 0
-        self.width = len(table) + action + self._history * len(measured)
+        self._errors = _errors_of(corrected.model) if settings.observe_errors else []
+        errors = sum(error(np.zeros((1, len(table)))).shape[1] for error in self._errors)
+        self.width = len(table) + action + errors + self._history * len(measured)
         self.memory_width = self._history * len(measured)
 
     def at(
@@ -186,5 +194,38 @@ class Features:
         parts = [rows]
         if self._corrected.settings.observe_base_action:
             parts.append(np.asarray(self._corrected.base_action(rows, state, episode_start), dtype=np.float64))
+        parts += [error(rows) for error in self._errors]
         features = np.concatenate([*parts, past], axis=1)
         return features, np.concatenate([measured, past], axis=1)[:, : self.memory_width]
+
+
+def _errors_of(model: RobotModel) -> list[Callable[[Array], Array]]:
+    """Differences between measurement and plan as functions of observations, (num_worlds, m) to (num_worlds, k)."""
+    encoder, reference = (model.observation_table.group(name) for name in ("encoder_angle", "reference_angle"))
+    errors: list[Callable[[Array], Array]] = [lambda rows: rows[:, encoder] - rows[:, reference]]
+    return [*errors, _ContactErrors(model)] if isinstance(model, WalkerModel) else errors
+
+
+class _ContactErrors:
+    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less the planned ones.
+
+    Zero where the feet carry too little for a ZMP.
+    """
+
+    _LEAST_N = 50.0
+
+    def __init__(self, model: WalkerModel) -> None:
+        table, biped = model.observation_table, model.biped
+        self._wrench, self._share, self._zmp = (table.group(n) for n in ("wrench", "load_share", "zmp_reference"))
+        rigid = biped.rigid
+        feet = [rigid.body(f"{side}_foot").id for side in SIDES]
+        self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
+        self._ankles = np.pad(biped.footholds, ((0, 0), (0, 1)), constant_values=biped.ankle_height)
+
+    def __call__(self, rows: Array) -> Array:
+        wrench = rows[:, self._wrench].reshape(-1, 2, 2, 3)
+        force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
+        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
+        vertical = force[:, :, 2].sum(axis=1)
+        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan) - rows[:, self._share][:, 0]
+        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0)
