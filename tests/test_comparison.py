@@ -29,8 +29,7 @@ from train.conditions import Condition, Member, PolicySpec
 from train.evaluate import Evaluation, evaluate
 from train.families import expand
 from train.progress import learning_curves
-from train.report import require_plotly, write_report
-from train.report_words import Results
+from train.report import Results, require_plotly, write_report
 from train.runs import run_folder
 from train.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
 

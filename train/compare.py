@@ -18,8 +18,7 @@ from train.environments import Environment, Reference, environment
 from train.evaluate import Evaluation, make_policy, make_vector_env
 from train.families import expand
 from train.figures import draw_figures
-from train.report import require_plotly, write_report
-from train.report_words import Results
+from train.report import Results, require_plotly, write_report
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
 from train.workers import run_conditions

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from train.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
-from train.chart_parts import (
+from train.environments import Column
+from train.evaluate import Evaluation
+from train.report.parts import (
     INK,
     LONGEST_NAME,
     VERDICTS,
@@ -24,8 +26,6 @@ from train.chart_parts import (
     round_numbers,
     shortened,
 )
-from train.environments import Column
-from train.evaluate import Evaluation
 from train.statistics import Estimate
 
 

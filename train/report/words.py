@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from train.changes import CEILING, HELD_OUT, Change, by_cell, families, level, percent_interval
-from train.chart_parts import Lines, number_interval
 from train.environments import Column
 from train.evaluate import Evaluation
 from train.families import Origin
 from train.progress import Curves, learning_curves
+from train.report.parts import Lines, number_interval
 
 SCORES = (
     "Mean over the episodes that reached the end; of residuals the interquartile mean over training seeds, with its "

@@ -6,7 +6,7 @@ import numpy as np
 
 from train.changes import Change, by_line, percent_interval
 from train.changes_tables import falls
-from train.report_words import SCORES, Results, in_short, marked, notes, scores, what
+from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
 
 
 def markdown(results: Results) -> str:

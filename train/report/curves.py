@@ -5,7 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from train.changes import level
-from train.chart_parts import (
+from train.environments import Column, Signal
+from train.evaluate import Evaluation
+from train.plots import line_style
+from train.progress import Curves
+from train.report.parts import (
     GRID,
     INK,
     LONGEST_NAME,
@@ -25,10 +29,6 @@ from train.chart_parts import (
     shortened,
     thinned,
 )
-from train.environments import Column, Signal
-from train.evaluate import Evaluation
-from train.plots import line_style
-from train.progress import Curves
 from train.walk_plots import intervals
 
 _SHADE = "#f1f3f5"

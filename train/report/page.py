@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 from train.changes import CEILING, Change, by_line, percent_interval
-from train.chart_parts import FONT, VERDICTS, Chart
+from train.report.parts import FONT, VERDICTS, Chart
 
 _STYLE = """
 :root { --ink: #1f2328; --soft: #59636e; --line: #d0d7de; --faint: #f6f8fa; --link: #0b5cad; }

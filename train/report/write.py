@@ -5,11 +5,11 @@ from pathlib import Path
 
 from elastic_env.errors import missing_extra
 from train.evaluate import Evaluation
-from train.report_charts import forest, ladder
-from train.report_curves import learning, over_time, sweep
-from train.report_markdown import markdown
-from train.report_page import Page, changes_html, definitions, fold, table
-from train.report_words import SCORES, Results, capital, in_short, notes, scores, what
+from train.report.charts import forest, ladder
+from train.report.curves import learning, over_time, sweep
+from train.report.markdown import markdown
+from train.report.page import Page, changes_html, definitions, fold, table
+from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
 
 MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
