@@ -28,7 +28,10 @@ _STATIC = CompareConfig(
 _MOTION = CompareConfig(
     name="demo",
     references=["sine"],
-    policies=[PolicySpec(name=name) for name in ("uncompensated", "input", "dynamic", "oracle")],
+    policies=[
+        *(PolicySpec(name=name) for name in ("uncompensated", "input", "dynamic", "oracle")),
+        PolicySpec(name="residual:testbed/seed_0", label="residual"),
+    ],
 )
 _SLOW_WALK = CompareConfig(
     name="demo",
