@@ -6,7 +6,6 @@ policy gains over them is what it makes of what it sees.
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,15 @@ from cmaes import CMA
 from baselines.residual import ResidualDescription
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.signals import Array
-from train.scores import Scores
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+from train.trainer import Trainer
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
 _CHECKPOINT = "checkpoint.json"
 
 
-class ConstantSearch:
-    """One training seed of a search, in a folder of its own, with the interface of `train.learn.Training`.
+class ConstantSearch(Trainer):
+    """One training seed of a search, in a folder of its own.
 
     In space `model` the joints of the left and the right leg share their constant: robot and walk are symmetric, and
     half as many numbers are found in less time. All candidates of a generation play the same episodes, as many in every
@@ -44,7 +43,8 @@ class ConstantSearch:
         options = {**_DEFAULTS, **config.algorithm_options}
         if options.keys() != _DEFAULTS.keys():
             raise unknown_name("option of CMA-ES", (options.keys() - _DEFAULTS.keys()).pop(), _DEFAULTS)
-        self.config, self.folder, self._population = config, folder, int(options["population_size"])
+        super().__init__(config, seed, folder, threads)
+        self._population = int(options["population_size"])
         episodes = config.worlds // (len(config.scenarios) * self._population)
         if episodes == 0:
             needed = len(config.scenarios) * self._population
@@ -68,28 +68,20 @@ class ConstantSearch:
             population_size=self._population,
         )  # fmt: skip
         self._told: list[list[float]] = []
-        self.done = 0
+        self._done = 0
         folder.mkdir(parents=True, exist_ok=True)
-        self._scores = Scores(config, seed, folder, threads)
         if (folder / _CHECKPOINT).exists():
             self._resume()
         self._scores.forget_after(self.done)
 
-    def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Search to the end of the configuration's decisions; `progress` is told the decisions done."""
-        config = self.config
-        if self.done == 0:
-            self._scores.evaluate(self.done, self._policy())
-        while self.done < config.decisions:
-            before, candidates = self.done, self._ask()
-            self._tell(candidates, self._play(candidates))
-            if config.is_due(config.evaluate_every, before, self.done):
-                self._scores.evaluate(self.done, self._policy())
-            if config.is_due(config.checkpoint_every, before, self.done):
-                self.checkpoint()
-            if progress is not None:
-                progress(self.done)
-        self._scores.keep("last", self.done, self._policy())
+    @property
+    def done(self) -> int:
+        """Decisions so far."""
+        return self._done
+
+    def _advance(self) -> None:
+        candidates = self._ask()
+        self._tell(candidates, self._play(candidates))
 
     def checkpoint(self) -> None:
         """Keep what the search was told: from its seed and that, its state follows."""
@@ -105,7 +97,7 @@ class ConstantSearch:
         state = json.loads((self.folder / _CHECKPOINT).read_text(encoding="utf-8"))
         for costs in state["told"]:
             self._tell(self._ask(), np.array(costs))
-        self.done = state["decisions"]
+        self._done = state["decisions"]
         self._scores.best = np.inf if state["best"] is None else state["best"]
 
     def _ask(self) -> Array:
@@ -128,7 +120,7 @@ class ConstantSearch:
         while alive.any():
             _, reward, terminated, truncated, _ = self._worlds.step(residuals)
             total += np.where(alive, reward, 0.0)
-            self.done += int(alive.sum())
+            self._done += int(alive.sum())
             alive &= ~(terminated | truncated)
         return -total.reshape(scenarios, self._population, self._episodes).mean(axis=(0, 2))
 

@@ -9,7 +9,6 @@ import os
 import random
 import shutil
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,9 @@ from baselines.residual import ResidualDescription
 from train.algorithms import algorithm_class
 from train.export import network_of
 from train.sb3_env import SB3VecEnv
-from train.scores import Scores
 from train.state import capture, read_state, restore, write_state
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+from train.trainer import Trainer
 
 _DEFAULTS: dict[str, dict[str, Any]] = {
     "PPO": {
@@ -41,7 +40,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Training:
+class Training(Trainer):
     """One training seed of a configuration, in a folder of its own.
 
     Args:
@@ -57,7 +56,7 @@ class Training:
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
         torch.set_num_threads(1)  # more would fight the threads of the physics
         torch.use_deterministic_algorithms(True)
-        self.config, self.folder = config, folder
+        super().__init__(config, seed, folder, threads)
         self._spread = np.random.default_rng(seed)
         self._worlds = SB3VecEnv(training_worlds(config, config.shares, threads), self._spread)
         options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
@@ -71,7 +70,6 @@ class Training:
         self._learning_rate = float(self.model.lr_schedule(1.0))
         self._shrink_last_layer()
         self.model.action_space.seed(seed)
-        self._scores = Scores(config, seed, folder, threads)
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
             self._resume()
@@ -82,24 +80,12 @@ class Training:
         """Decisions so far."""
         return int(self.model.num_timesteps)
 
-    def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Train to the end of the configuration's decisions; `progress` is told the decisions done."""
-        config = self.config
-        if self.done == 0:
-            self._evaluate()
-        while self.done < config.decisions:
-            before = self.done
-            if config.anneal:
-                rate = self._learning_rate * (1.0 - before / config.decisions)
-                self.model.lr_schedule = lambda _, rate=rate: rate
-            self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=10**9)
-            if config.is_due(config.evaluate_every, before, self.done):
-                self._evaluate()
-            if config.is_due(config.checkpoint_every, before, self.done):
-                self.checkpoint()
-            if progress is not None:
-                progress(self.done)
-        self._scores.keep("last", self.done, self._policy())
+    def _advance(self) -> None:
+        before = self.done
+        if self.config.anneal:
+            rate = self._learning_rate * (1.0 - before / self.config.decisions)
+            self.model.lr_schedule = lambda _: rate
+        self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=10**9)
 
     def checkpoint(self) -> None:
         """Keep everything that the rest of the training depends on; a kill between its steps loses nothing."""
@@ -232,7 +218,7 @@ class Training:
     def _evaluate(self) -> None:
         """Score the present policy, without a trace in the random states of the training."""
         states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
-        self._scores.evaluate(self.done, self._policy())
+        super()._evaluate()
         torch.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -13,6 +12,7 @@ from train.environments import environment
 from train.progress import read_progress
 from train.runs import new_run
 from train.train_config import TrainConfig
+from train.trainer import Trainer
 from train.workers import progress_bar, side_by_side
 
 _CONFIG = "config.yaml"
@@ -81,7 +81,7 @@ def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, repo
     report(config.decisions)
 
 
-def _trainer(config: TrainConfig) -> type[Any]:
+def _trainer(config: TrainConfig) -> type[Trainer]:
     if config.algorithm == CONSTANTS:
         from train.constant_search import ConstantSearch
 
