@@ -5,9 +5,10 @@ A state is read as one block per servo. Each request asks for another length tha
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from dynamixel_sdk import COMM_SUCCESS
@@ -175,6 +176,19 @@ class Bus:
         self.port.release()
         self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
 
+    def confirm_torque_off(self) -> list[str]:
+        """Servos that do not say that their torque is off, after some tries each."""
+        return [f"servo {i} at {self.name}" for i in self.ids if not self._is_off(i)]
+
+    def _is_off(self, servo_id: int) -> bool:
+        try:
+            if self.read(servo_id, "torque_enable") == 0:
+                return True
+            self.write(servo_id, "torque_enable", 0)
+        except ReplyError:
+            return False
+        return True
+
     def read_states(self, timeout_s: float) -> States:
         """Position, velocity and current of all servos.
 
@@ -264,7 +278,7 @@ class Bus:
 
 
 class Buses:
-    """Several buses as one: each has its own port and a reader of its own, so that they work at the same time.
+    """Several buses as one: each has a reader of its own, so that they work at the same time.
 
     Args:
         buses: With their servos attached; an array of all servos has theirs in this order.
@@ -272,17 +286,21 @@ class Buses:
 
     def __init__(self, buses: Sequence[Bus]) -> None:
         self.buses = tuple(buses)
-        self._ends = np.cumsum([len(bus.ids) for bus in buses])[:-1]
-        self._readers = ThreadPoolExecutor(len(buses), thread_name_prefix="bus")
+        self._readers = [ThreadPoolExecutor(1, thread_name_prefix=bus.name) for bus in buses[1:]]
+
+    @property
+    def num_servos(self) -> int:
+        """How many servos there are on all of them."""
+        return sum(len(bus.ids) for bus in self.buses)
 
     def write_goals(self, angles: Array) -> None:
         """Command all servos, (n,) [rad]."""
-        parts = np.split(angles, self._ends)
-        list(self._readers.map(lambda bus, part: bus.write_goals(part), self.buses, parts))
+        ends = np.cumsum([len(bus.ids) for bus in self.buses])[:-1]
+        self._on_each(lambda bus, part: bus.write_goals(part), np.split(angles, ends))
 
     def read_states(self, timeout_s: float) -> States:
         """The states of all servos; the time is that of the last reply."""
-        parts = list(self._readers.map(lambda bus: bus.read_states(timeout_s), self.buses))
+        parts = self._on_each(lambda bus, _: bus.read_states(timeout_s))
         names = ("position", "velocity", "current", "is_fresh", "has_alert")
         joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
         return States(*joined, time_s=max(part.time_s for part in parts))
@@ -293,13 +311,28 @@ class Buses:
         Raises:
             BusGoneError: A bus is gone; all others are off.
         """
-        errors = [future.exception() for future in [self._readers.submit(bus.torque_off) for bus in self.buses]]
-        for error in errors:
-            if error is not None:
-                raise error
+        self._on_each(lambda bus, _: bus.torque_off())
+
+    def confirm_torque_off(self) -> list[str]:
+        """Servos that do not say that their torque is off."""
+        return [name for names in self._on_each(lambda bus, _: bus.confirm_torque_off()) for name in names]
 
     def close(self) -> None:
         """Give all ports back."""
-        self._readers.shutdown()
+        for reader in self._readers:
+            reader.shutdown()
         for bus in self.buses:
             bus.close()
+
+    def _on_each(self, function: Callable[[Bus, Any], Any], parts: Sequence[Any] | None = None) -> list[Any]:
+        """Call a function for every bus, the first in this thread; all of them are done when an error is raised."""
+        given = [None] * len(self.buses) if parts is None else parts
+        waiting = [
+            reader.submit(function, bus, part)
+            for reader, bus, part in zip(self._readers, self.buses[1:], given[1:], strict=True)
+        ]
+        try:
+            first = function(self.buses[0], given[0])
+        finally:
+            wait(waiting)
+        return [first, *(future.result() for future in waiting)]
