@@ -1,4 +1,4 @@
-"""The testbed on real hardware: Dynamixel servos, a MicroStrain IMU, and an emulator of both that runs on the real SDKs.
+"""The testbed on real hardware: Dynamixel servos, a MicroStrain IMU, and an emulator of both.
 
     env → supervised bus ──socket──→ supervisor (limits, torque off) → bus → dynamixel-sdk → port
     env → attitude stream ──pipe──→ IMU reader → pymscl → port

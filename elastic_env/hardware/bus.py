@@ -244,8 +244,8 @@ class Bus:
                     return data
             self._wait_for_silence()
         raise ReplyError(
-            f"servo {servo_id} at {self.name} does not answer ({self.port.baudrate} bit/s); check power, wiring, id and "
-            "baud rate, see: elastic hardware scan"
+            f"servo {servo_id} at {self.name} does not answer ({self.port.baudrate} bit/s); check power, wiring, id "
+            "and baud rate, see: elastic hardware scan"
         )
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:

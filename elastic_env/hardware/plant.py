@@ -9,7 +9,7 @@ import numpy as np
 
 from elastic_env.hardware.attitude import AttitudeStream, link_angle
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.realtime import prefer_realtime
+from elastic_env.hardware.realtime import give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle, SupervisedBus
 from elastic_env.hardware.torque_line import torque_of_current
@@ -48,19 +48,27 @@ class ServoPlant:
         at: Where motor and link angle stand in them.
         settings: Wiring, mounting and limits.
         period_s: Control period [s].
+        pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first motion [N·m].
     """
 
     num_worlds = 1
 
     def __init__(
-        self, model: mujoco.MjModel, at: JointAddresses, settings: HardwareSettings, period_s: float
+        self,
+        model: mujoco.MjModel,
+        at: JointAddresses,
+        settings: HardwareSettings,
+        period_s: float,
+        pendulum_nm: float,
     ) -> None:
         self.model, self.settings = model, settings
-        self.qpos, self.qvel = np.full((1, model.nq), np.nan), np.full((1, model.nv), np.nan)
-        self.act, self.ctrl = np.zeros((1, model.na)), np.zeros((1, model.nu))
+        self.qpos: Array = np.full((1, model.nq), np.nan)
+        self.qvel: Array = np.full((1, model.nv), np.nan)
+        self.act: Array = np.zeros((1, model.na))
+        self.ctrl: Array = np.zeros((1, model.nu))
         self.motor_torque = np.full(1, np.nan)
         self.timing = Timing()
-        self._at, self._period_s = at, period_s
+        self._at, self._period_s, self._pendulum_nm = at, period_s, pendulum_nm
         self._bus: SupervisedBus | None = None
         self._imu: AttitudeStream | None = None
         self._is_agreed = not settings.confirm
@@ -98,13 +106,11 @@ class ServoPlant:
             raise
 
     def finish(self) -> None:
-        """Slowly back to where the pendulum hangs, then torque off."""
+        """Slowly back to where the pendulum hangs, then torque off; the ports are free for other programs."""
         try:
             self._move(self._goal, 0.0)
-            self._opened().disable()
-        except BaseException:
+        finally:
             self.close()
-            raise
 
     def close(self) -> None:
         """Torque off; ports closed."""
@@ -116,6 +122,8 @@ class ServoPlant:
         finally:
             if imu is not None:
                 imu.close()
+            if bus is not None:
+                give_up_realtime()
 
     def restart(self, worlds: BoolArray) -> None:
         """See `Simulation`; an episode begins with `begin`."""
@@ -162,13 +170,14 @@ class ServoPlant:
             return
         limits = self.settings.limits
         question = (
-            f"The servo at {self.settings.port} will move to {angle:.3f} rad and then between {limits.lowest_rad:g} and "
-            f"{limits.highest_rad:g} rad. Is the pendulum's way free, and the power switch in reach? Type yes: "
+            f"The servo at {self.settings.port} will move to {angle:.3f} rad, then between {limits.lowest_rad:g} and "
+            f"{limits.highest_rad:g} rad, with a pendulum of {self._pendulum_nm:.1f} N·m. Is its way free, and the "
+            "power switch in reach? Type yes: "
         )
         if not sys.stdin.isatty():
             raise HardwareError(
-                f"nobody is at the terminal to agree to a motion at {self.settings.port}; if the way is free, say so by "
-                "confirm=False, or --yes"
+                f"nobody is at the terminal to agree to a motion at {self.settings.port}; if the way is free, say so "
+                "by confirm=False, or --yes"
             )
         if input(question).strip().lower() != "yes":
             raise HardwareError(f"nobody agreed to the motion at {self.settings.port}; nothing has moved")
@@ -224,6 +233,4 @@ class ServoPlant:
         self.motor_torque[0] = settings.direction * float(torque_of_current(cycle.states.current[0]))
         if self._imu is not None:
             sample = self._imu.latest()
-            self.qpos[0, at.q[0]] = link_angle(
-                sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad
-            )
+            self.qpos[0, at.q[0]] = link_angle(sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)

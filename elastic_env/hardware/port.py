@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from elastic_env.errors import missing_extra
 from elastic_env.hardware import protocol
@@ -50,8 +50,8 @@ def bus_gone(port: str) -> Iterator[None]:
         yield
     except (serial.SerialException, OSError, termios.error) as error:
         raise BusGoneError(
-            f"the bus at {port} is gone ({error}): unplugged, or its adapter failed. Servos without a bus watchdog hold "
-            "their last goal: switch their power off"
+            f"the bus at {port} is gone ({_words(error)}): unplugged, or its adapter failed. Servos without a bus "
+            "watchdog hold their last goal: switch their power off"
         ) from None
 
 
@@ -90,11 +90,10 @@ class Port(PortHandler):
                 f"(fuser {name} says which it is), or name another port"
             ) from None
 
-    def setupPort(self, cflag_baud: int) -> bool:  # noqa: ARG002, N802  the SDK's name
+    def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: ARG002, N802  the SDK's name
         """Open the device such that a read blocks for a short while instead of not at all."""
         self.ser = serial.Serial(self.port_name, self.baudrate, timeout=_READ_SLICE_S, write_timeout=0.1)
         self.is_open = True
-        # the lock is asked for before anything that is waiting is thrown away
         self.tx_time_per_byte = 1e4 / self.baudrate
         return True
 
@@ -130,7 +129,7 @@ class Port(PortHandler):
 class PacketHandler(Protocol2PacketHandler):
     """The SDK's packet handler with byte stuffing in both directions."""
 
-    def txPacket(self, port: Any, txpacket: list[int]) -> int:  # noqa: N802  the SDK's name
+    def txPacket(self, port: Any, txpacket: list[int]) -> Any:  # noqa: N802  the SDK's name
         """Send an instruction that the SDK has laid out: id, instruction and parameters at their places."""
         if port.is_using:
             return COMM_PORT_BUSY
@@ -150,6 +149,11 @@ class PacketHandler(Protocol2PacketHandler):
         body = protocol.unstuff(bytes(packet[7:-2]))
         length = len(body) + 2
         return [*packet[:5], length & 0xFF, length >> 8, *body, *packet[-2:]]
+
+
+def _words(error: Exception) -> str:
+    """What an error says; termios gives a number and a text."""
+    return str(error.args[1]) if len(error.args) > 1 else str(error)
 
 
 def _cannot_open(name: str, error: Any) -> PortError:

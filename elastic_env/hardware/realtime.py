@@ -15,6 +15,12 @@ def prefer_realtime() -> bool:
     return False
 
 
+def give_up_realtime() -> None:
+    """Back to the scheduling of all others."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def sleep_until(moment_s: float) -> None:
     """Wait for a moment of the monotonic clock."""
     remaining = moment_s - time.monotonic()

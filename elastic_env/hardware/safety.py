@@ -13,7 +13,7 @@ from elastic_env.signals import Array, BoolArray, IntArray
 
 
 class SafetyLimits(Model):
-    """What no command may exceed, and what stops the motion when it is measured. Angles in the servo's zero and sign."""
+    """What no command may exceed, and what stops the motion when it is measured; angles as the servo has them."""
 
     lowest_rad: float = quantity("rad", -1.6, description="lowest goal")
     highest_rad: float = quantity("rad", 1.6, description="highest goal")
@@ -52,8 +52,8 @@ class Guard:
         outside = self._outside(self.goals)
         if outside.any() or not np.isfinite(self.goals).all():
             raise FaultError(
-                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad, the servos stand at "
-                f"{np.round(self.goals, 3).tolist()} rad; move them by hand while torque is off, or widen the limits"
+                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad, the servos stand "
+                f"at {np.round(self.goals, 3).tolist()} rad; move them by hand while torque is off, or widen the limits"
             )
 
     @property

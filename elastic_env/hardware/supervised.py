@@ -115,7 +115,7 @@ class SupervisedBus:
         return _states(self._ask("read"))
 
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
-        """Hold goals from a thread until the next cycle, for at most a time: for what comes between moving and stepping.
+        """Hold goals from a thread until the next cycle, for at most a time: between moving and stepping.
 
         A program that hangs as a whole takes the thread with it, and torque goes off as ever.
         """

@@ -159,8 +159,8 @@ class Supervisor:
         status = bus.read(servo_id, "hardware_error_status")
         if status:
             raise FaultError(
-                f"servo {servo_id} at {bus.name} reports {explain_errors(status) or f'error {status}'}; remove the cause, "
-                "then switch its power off and on"
+                f"servo {servo_id} at {bus.name} reports {explain_errors(status) or f'error {status}'}; remove the "
+                "cause, then switch its power off and on"
             )
 
     def _alerts(self, states: States) -> str:

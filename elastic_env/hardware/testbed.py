@@ -5,7 +5,7 @@ What differs, because a real joint does not tell it:
 | signal | here |
 |---|---|
 | `link_angle`, `link_error`, `deflection` | from the IMU, with its offset and noise; nan without one |
-| `joint_torque` | from the motor current by a measured line: a rough figure, and in motion that of the motor, not of the spring |
+| `joint_torque` | from the motor current by a measured line: rough, and in motion the motor's, not the spring's |
 | reward | its term `link_error` is by the IMU; nan without one |
 | `truth()`, and with it the policy `oracle` | an error |
 
@@ -60,7 +60,7 @@ class HardwareTestbedTask(TestbedTask):
 
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         super().__init__(config, num_worlds=1)
-        self.plant = ServoPlant(self.model, self._at, settings, config.control_period_s)
+        self.plant = ServoPlant(self.model, self._at, settings, config.control_period_s, config.pendulum.gravity_torque)
         reach = config.reference.extent().q
         limits = settings.limits
         if not limits.lowest_rad <= -reach <= reach <= limits.highest_rad:
@@ -119,7 +119,7 @@ class HardwareTestbedTask(TestbedTask):
         Raises:
             HardwareError: Always.
         """
-        raise HardwareError("hardware has no truth: the policy 'oracle' and scores against the true link need a simulation")
+        raise HardwareError("hardware has no truth: the policy 'oracle' and scores by the true link need a simulation")
 
     def _measure(self, worlds: BoolArray) -> Measurement:  # noqa: ARG002  there is one
         """The encoder's change is that of a control period also where a cycle had to be repeated."""

@@ -40,6 +40,10 @@ class RunningEmulator:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
         return self._ask({"state": True})
 
+    def wait(self) -> None:
+        """Wait until it ends by itself, or an interrupt comes."""
+        self._process.wait()
+
     def close(self) -> None:
         """End it."""
         if self._process.stdin is not None:

@@ -82,7 +82,7 @@ class EmulatedServo:
         self._set("present_current", round(current_of_torque(joint.torque) / model.current_unit))
 
     def overload(self, is_overloaded: bool) -> None:
-        """Begin or end an overload: the status shows it, and the servo lets go (shutdown bit of the factory setting)."""
+        """Begin or end an overload: the status shows it, and the servo lets go (factory setting of shutdown)."""
         self._set("hardware_error_status", OVERLOAD if is_overloaded else 0)
         if is_overloaded and self.is_on:
             self._change("torque_enable", 0)
