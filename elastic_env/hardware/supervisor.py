@@ -76,7 +76,7 @@ class Supervisor:
             self._guard = None
             return {"error": "gone", "message": str(error)}
         except HardwareError as error:
-            if self._guard is not None:
+            if self._guard is not None:  # torque is still on
                 self._stop(str(error))
                 return {"error": "fault", "message": self._fault}
             return {"error": "fault" if isinstance(error, FaultError) else "refused", "message": str(error)}
@@ -132,7 +132,8 @@ class Supervisor:
         states = self._bus.read_states(_REPLY_TIMEOUT_S)
         reason = guard.take(states)
         if reason:
-            raise FaultError(reason + self._alerts(states))
+            self._stop(reason)
+            raise FaultError(self._fault + self._alerts(states))
         return {
             **_plain(states), "goals": allowed.tolist(), "limited": is_limited.tolist(), "held": was_holding,
             "late_s": begin - at,

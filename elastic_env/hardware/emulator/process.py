@@ -79,7 +79,7 @@ class Emulator:
 
     config: EmulatorConfig
     events: deque[tuple[float, int, str, int]] = field(default_factory=lambda: deque(maxlen=_KEPT_EVENTS))
-    """When, at which servo, which register became what: torque, goal and watchdog; and `served` positions."""
+    """When, at which servo, which register became what: torque, goal and watchdog; and which position was asked for."""
 
     def __post_init__(self) -> None:
         config, model = self.config, servo_model(self.config.model_number)
@@ -108,6 +108,9 @@ class Emulator:
             servo.watch(now)
         if self.bus_terminal is not None and self.bus_terminal.master in ready:
             for packet in self._parser.feed(self.bus_terminal.read()):
+                if packet.instruction == protocol.SYNC_READ:
+                    for servo in self._servos:
+                        self.events.append((now, servo.servo_id, "present_position", servo.present_position))
                 self._queue(self._bus.answer(packet, now), now)
         self._send_due(time.monotonic())
         self._send_attitude(now)

@@ -33,7 +33,10 @@ class RunningEmulator:
         self._take_ports(self._ask({"faults": changes}))
 
     def events(self) -> list[tuple[float, int, str, int]]:
-        """What has been switched and commanded since the last call: monotonic time, id, register, value [count]."""
+        """What has been switched, commanded and asked for since the last call.
+
+        Monotonic time, id, register, value [count]; `present_position` is what a state that was asked for is to tell.
+        """
         return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._ask({"events": True})]
 
     def state(self) -> dict[str, Any]:

@@ -74,6 +74,11 @@ class EmulatedServo:
         """Goal position [rad]."""
         return self._get("goal_position") * self.model.position_unit
 
+    @property
+    def present_position(self) -> int:
+        """What it measured last [count]."""
+        return self._get("present_position")
+
     def measure(self) -> None:
         """Put what it measures into its registers."""
         model, joint = self.model, self.joint
