@@ -6,8 +6,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -15,7 +17,7 @@ import numpy as np
 
 import elastic_env  # noqa: F401  registers the environments
 from baselines.identification import identify
-from elastic_env.hardware.bus import Bus
+from elastic_env.hardware.bus import Bus, States
 from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults
@@ -29,7 +31,12 @@ from train.wave import PERIOD_S, goal
 _USB_LATENCY = Faults(latency_s=1e-3)
 _TORQUE_OFF_S = 0.1
 _REPLY_TIMEOUT_S = 0.003
-_CLOCK_S = 1e-3  # what two processes may disagree by about when something was
+_CLOCK_S = 1e-3  # for a packet on its way between two processes
+_CYCLES_BETWEEN = 6
+_PAIR = (1, 2)
+_UNIT = servo_model(54024).position_unit
+
+Event = tuple[float, int, str, int]
 
 
 @dataclass
@@ -71,6 +78,7 @@ def identification(share: float) -> Trial:
         real = gymnasium.make(
             "elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port,
             imu_port=emulator.imu_port, reference=hold, confirm=False, approach_rad_s=1.0,
+            limits={"patience_cycles": 10},  # here it is about K; a busy computer delays pseudo-terminals
         )  # fmt: skip
         try:
             (over_bus,), _ = identify([real], seed=0)
@@ -147,39 +155,31 @@ def faults(share: float) -> Trial:
     """Random faults during a motion that also asks for what it must not have."""
     number, generator = _times(1000, share), np.random.default_rng(0)
     limits = SafetyLimits(lowest_rad=-0.5, highest_rad=0.5, slew_rad_s=1.5)
-    tally = {"wrong": 0, "beyond": 0, "late_off": 0, "stopped": 0, "accepted": 0, "missing": 0, "reasons": {}}
-    slowest_off_s = 0.0
-    ids = (1, 2)
-    with RunningEmulator(EmulatorConfig(ids=ids)) as emulator, SupervisedBus({emulator.port: ids}) as bus:
-        begin = time.monotonic()
-        is_moving = False
+    tally, reasons, off_s = Counter[str](), Counter[str](), []
+    with RunningEmulator(EmulatorConfig(ids=_PAIR)) as emulator, SupervisedBus({emulator.port: _PAIR}) as bus:
+        begin, is_moving = time.monotonic(), False
         for _ in range(number):
             if not is_moving:
                 bus.enable(limits)
                 emulator.events()
-                is_moving = True
             fault, cycles = _random_fault(generator)
-            seen: list[Any] = []
             emulator.faults(**fault)
-            message = _cycles(bus, begin, cycles, generator, seen)
+            seen, message = _cycles(bus, begin, cycles, generator)
             emulator.faults(**dict.fromkeys(fault, 0))
-            message = message or _cycles(bus, begin, 6, generator, seen)
-            found = _judge(emulator.events(), seen, limits, message)
-            for key in ("wrong", "beyond", "accepted", "missing"):
-                tally[key] += found[key]
+            if not message:
+                more, message = _cycles(bus, begin, _CYCLES_BETWEEN, generator)
+                seen += more
+            events, is_moving = emulator.events(), not message
+            tally.update({**_taken(events, seen), "beyond": _beyond(events, limits)})
             if message:
-                is_moving = False
-                tally["stopped"] += 1
-                tally["late_off"] += found["off_s"] > PERIOD_S + _CLOCK_S
-                slowest_off_s = max(slowest_off_s, found["off_s"])
-                reason = message.split(";")[0].split(":")[0]
-                tally["reasons"][reason] = tally["reasons"].get(reason, 0) + 1
-    is_met = not (tally["wrong"] or tally["beyond"] or tally["late_off"])
+                reasons[message.split(";")[0].split(":")[0]] += 1
+                off_s.append(_off_after_fault(events))
+    slow = sum(not t <= PERIOD_S + _CLOCK_S for t in off_s)
     return Trial(
-        "faults", "1000 faults: no wrong value taken, no goal beyond the limits, torque off within one cycle of a fault",
+        "faults", "1000 faults: no wrong value taken, no goal beyond the limits, torque off within a cycle of a fault",
         f"{number} faults: {tally['wrong']} wrong of {tally['accepted']} replies taken, {tally['missing']} missing, "
-        f"{tally['beyond']} goals beyond, {tally['stopped']} stops, torque off after at most {1e3 * slowest_off_s:.1f} ms",
-        is_met, {**tally, "slowest_off_s": slowest_off_s},
+        f"{tally['beyond']} goals beyond, {len(off_s)} stops, torque off after at most {1e3 * max(off_s):.1f} ms",
+        not (tally["wrong"] or tally["beyond"] or slow), {**tally, "reasons": dict(reasons), "off_s": off_s},
     )  # fmt: skip
 
 
@@ -194,50 +194,54 @@ def _random_fault(generator: np.random.Generator) -> tuple[dict[str, Any], int]:
     return fault, int(generator.integers(1, 6))
 
 
-def _cycles(bus: SupervisedBus, begin: float, number: int, generator: np.random.Generator, seen: list[Any]) -> str:
-    """Cycles with now and then a wild goal; what stopped them, "" if nothing."""
+def _cycles(
+    bus: SupervisedBus, begin: float, number: int, generator: np.random.Generator
+) -> tuple[list[tuple[float, States]], str]:
+    """Cycles with now and then a wild goal: when each was read, what came, and what stopped them, "" if nothing."""
+    seen = []
     for _ in range(number):
         due = time.monotonic() + PERIOD_S
         wild = generator.normal(size=2) * 2.0 if generator.random() < 0.1 else 0.0
         try:
-            seen.append(bus.exchange(np.full(2, goal(due - begin)) + wild, due).states)
+            cycle = bus.exchange(np.full(2, goal(due - begin)) + wild, due)
         except FaultError as error:
-            seen.append(None)
-            return str(error)
-    return ""
+            return seen, str(error)
+        seen.append((due + cycle.late_s, cycle.states))
+    return seen, ""
 
 
-def _judge(events: list[Any], seen: list[Any], limits: SafetyLimits, message: str) -> dict[str, Any]:
-    """Compare what was taken for a state with what the servos had to say to the very same request."""
-    unit = servo_model(54024).position_unit
-    asked = {
-        i: [value for _, servo, name, value in events if servo == i and name == "present_position"] for i in (1, 2)
-    }
-    result: dict[str, Any] = {"wrong": 0, "beyond": 0, "accepted": 0, "missing": 0, "off_s": 0.0}
-    for number, states in enumerate(seen):
-        for column, servo in enumerate((1, 2)):
-            if states is None:
-                continue
+def _taken(events: Sequence[Event], seen: Sequence[tuple[float, States]]) -> dict[str, int]:
+    """Compare each position that was taken with what the servo had to say to that very request."""
+    wrong = accepted = missing = 0
+    for read_s, states in seen:
+        for column, servo in enumerate(_PAIR):
             if not states.is_fresh[column]:
-                result["missing"] += 1
+                missing += 1
                 continue
-            result["accepted"] += 1
-            result["wrong"] += round(states.position[column] / unit) != asked[servo][number]
-    goals = {
-        i: [(t, v * unit) for t, servo, name, v in events if servo == i and name == "goal_position"] for i in (1, 2)
-    }
-    for written in goals.values():
-        for (_, before), (_, after) in zip(written, written[1:], strict=False):
-            result["beyond"] += abs(after - before) > limits.slew_rad_s * 0.02 + unit
-        result["beyond"] += sum(
-            not limits.lowest_rad - unit <= angle <= limits.highest_rad + unit for _, angle in written
-        )
-    if message:
-        off = [t for t, _, name, value in events if name == "torque_enable" and value == 0]
-        last_asked = max((t for t, _, name, _ in events if name == "present_position"), default=np.nan)
-        after = [t for t in off if t >= last_asked]
-        result["off_s"] = max(min(after, default=np.inf) - last_asked - _REPLY_TIMEOUT_S, 0.0)
-    return result
+            asked = [
+                value for t, who, name, value in events
+                if who == servo and name == "present_position" and read_s - _CLOCK_S <= t <= states.time_s
+            ]  # fmt: skip
+            accepted += 1
+            wrong += not asked or round(states.position[column] / _UNIT) != asked[-1]
+    return {"wrong": wrong, "accepted": accepted, "missing": missing}
+
+
+def _beyond(events: Sequence[Event], limits: SafetyLimits) -> int:
+    """Goals that arrived at a servo beyond its limits, or farther from the last one than any cycle allows."""
+    number = 0
+    for servo in _PAIR:
+        goals = [value * _UNIT for _, who, name, value in events if who == servo and name == "goal_position"]
+        number += sum(abs(after - before) > limits.slew_rad_s * 0.02 + _UNIT for before, after in pairwise(goals))
+        number += sum(not limits.lowest_rad - _UNIT <= angle <= limits.highest_rad + _UNIT for angle in goals)
+    return number
+
+
+def _off_after_fault(events: Sequence[Event]) -> float:
+    """Time from the end of the wait for the last reply to torque off at the servos [s]."""
+    asked = max((t for t, _, name, _ in events if name == "present_position"), default=np.inf)
+    off = [t for t, _, name, value in events if name == "torque_enable" and value == 0 and t >= asked]
+    return max(min(off, default=np.inf) - asked - _REPLY_TIMEOUT_S, 0.0)
 
 
 def killed(share: float) -> Trial:
@@ -293,6 +297,7 @@ def _ended(name: str, required: str, share: float, end: Callable[[Any, int], Non
 
 
 def _end_once(emulator: RunningEmulator, generator: np.random.Generator, end: Callable[[Any, int], None]) -> float:
+    supervisor = None
     program = subprocess.Popen(
         [sys.executable, "-m", "train.wave", emulator.port, "1"], stdout=subprocess.PIPE, text=True,
         start_new_session=True,
@@ -317,16 +322,17 @@ def _end_once(emulator: RunningEmulator, generator: np.random.Generator, end: Ca
     finally:
         program.kill()
         program.communicate()
-        with contextlib.suppress(ProcessLookupError, UnboundLocalError):
+        if supervisor is not None:
             _wait_for_end(supervisor)
 
 
 def _wait_for_end(process: int) -> None:
     """Wait until a process that is no child has ended."""
     deadline = time.monotonic() + 5.0
-    while time.monotonic() < deadline:
-        os.kill(process, 0)
-        time.sleep(0.005)
+    with contextlib.suppress(ProcessLookupError):
+        while time.monotonic() < deadline:
+            os.kill(process, 0)
+            time.sleep(0.005)
 
 
 def unplugged(share: float) -> Trial:

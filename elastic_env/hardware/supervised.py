@@ -187,6 +187,8 @@ class SupervisedBus:
 
     def _without_supervisor(self) -> FaultError:
         """The supervisor died: switch torque off in its place."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
         code = self._process.poll()
         said = emergency_stop(self._ports, self._baudrate)
         return FaultError(f"the supervisor process ended (exit code {code}); {said}")

@@ -29,7 +29,7 @@ from elastic_env.hardware.realtime import prefer_realtime
 from elastic_env.sensors import attitude
 
 _PHYSICS_S = 2e-3
-_UNREAD_BYTES = 400
+_UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
 
 
