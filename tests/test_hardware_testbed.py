@@ -191,8 +191,8 @@ def test_identification_over_the_bus_finds_the_emulated_stiffness() -> None:
     soft = configure_testbed(scenario="ideal", stiffness=600.0, joint={"damping": 60.0})
     with RunningEmulator(EmulatorConfig(testbed=soft)) as emulator:
         env = make_hardware(emulator, imu_port=emulator.imu_port, reference={
-            "kind": "hold", "positions": 5, "lower": -0.3, "upper": 0.3, "rate": 1.0, "shortest_move_s": 0.4,
-            "settle_s": 0.25, "measure_s": 0.1, "overrun": 0.02,
+            "kind": "hold", "positions": 5, "lower": -0.3, "upper": 0.3, "rate": 1.0, "shortest_move_s": 0.35,
+            "settle_s": 0.25, "measure_s": 0.08, "overrun": 0.02,
         })  # fmt: skip
         (found,), _ = identify([env], seed=0)
     assert found.stiffness_nm_per_rad == pytest.approx(600.0, rel=0.05)

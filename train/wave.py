@@ -4,6 +4,7 @@ python -m train.wave PORT ID ...
 """
 
 import math
+import signal
 import sys
 import time
 
@@ -24,6 +25,7 @@ def goal(elapsed_s: float) -> float:
 
 def main(port: str, ids: list[int]) -> None:
     """Move until ended; says the supervisor's process id when the motion has begun."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
     with SupervisedBus({port: ids}) as bus:
         bus.enable()
         begin = due = time.monotonic()
