@@ -76,21 +76,28 @@ def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
 
 
 def test_watchdog_stops_models_that_have_one() -> None:
-    """Catches a watchdog that fires while the bus speaks, or never, or on the firmware that has none."""
+    """Catches a watchdog that fires while the bus speaks, or never, or on the firmware that has none.
+
+    A fired one holds the servo where it is, under torque, and refuses goals until it is cleared.
+    """
     servo = make_servo(2020)
     servo.hear(10.0)
     write(servo, "torque_enable", 1)
     write(servo, "bus_watchdog", 3)
+    write(servo, "goal_position", 5000)
     servo.watch(10.05)
-    assert servo.is_on
+    assert read(servo, "goal_position") == 5000
     servo.watch(10.07)
-    assert not servo.is_on
-    assert read(servo, "bus_watchdog") == -1
+    assert servo.is_on
+    assert (read(servo, "goal_position"), read(servo, "bus_watchdog")) == (0, -1)
+    assert write(servo, "goal_position", 5000) == protocol.RANGE_ERROR
+    write(servo, "bus_watchdog", 0)
+    assert write(servo, "goal_position", 5000) == 0
     old = make_servo(54024)
     old.hear(0.0)
-    write(old, "torque_enable", 1)
+    write(old, "goal_position", 5000)
     old.watch(100.0)
-    assert old.is_on
+    assert read(old, "goal_position") == 5000
 
 
 def answers(bus: EmulatedBus, wire: bytes) -> list[Packet]:

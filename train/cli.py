@@ -38,10 +38,9 @@ class OnHardware:
         """Arguments of the environment on hardware; empty for the simulation."""
         if self.port is None and self.mounting is None and self.imu_port is None and not self.yes:
             return {}
-        with _hardware():
-            from train.hardware import hardware_arguments
+        from train.hardware import hardware_arguments
 
-            return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
+        return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
 
 
 @dataclass
@@ -430,21 +429,20 @@ class Emulate:
 
     def run(self) -> None:
         """Emulate."""
-        with _hardware():
-            from elastic_env.entry_points import configure_testbed
-            from elastic_env.hardware.emulator.config import EmulatorConfig
-            from elastic_env.hardware.emulator.faults import Faults
-            from train.hardware import emulate
+        from elastic_env.entry_points import configure_testbed
+        from elastic_env.hardware.emulator.config import EmulatorConfig
+        from elastic_env.hardware.emulator.faults import Faults
+        from train.hardware import emulate
 
-            faults = Faults(
-                lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
-                latency_s=1e-3 * self.latency_ms,
-            )  # fmt: skip
-            config = EmulatorConfig(
-                ids=tuple(self.ids), model_number=self.model_number, faults=faults, seed=self.seed,
-                testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
-            )  # fmt: skip
-            emulate(config, _CONSOLE)
+        faults = Faults(
+            lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
+            latency_s=1e-3 * self.latency_ms,
+        )  # fmt: skip
+        config = EmulatorConfig(
+            ids=tuple(self.ids), model_number=self.model_number, faults=faults, seed=self.seed,
+            testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
+        )  # fmt: skip
+        emulate(config, _CONSOLE)
 
 
 @dataclass
@@ -463,11 +461,10 @@ class Prove:
 
     def run(self) -> None:
         """Measure."""
-        with _hardware():
-            from train.prove_hardware import prove
+        from train.prove_hardware import prove
 
-            if not prove(self.share, self.only, _CONSOLE, self.output):
-                sys.exit(1)
+        if not prove(self.share, self.only, _CONSOLE, self.output):
+            sys.exit(1)
 
 
 @dataclass
@@ -484,8 +481,7 @@ class Hardware:
 
     def run(self) -> None:
         """Do what was asked for."""
-        with _hardware():
-            self.command.run()
+        self.command.run()
 
 
 Command = (
@@ -518,17 +514,6 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")
         os._exit(130)  # worker processes must not keep the terminal waiting
-
-
-@contextmanager
-def _hardware() -> Iterator[None]:
-    """Say which extra to install where the packages of the hardware are missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise ConfigurationError(
-            f"hardware needs {error.name}; install the extra: pip install 'elastic-env[hardware]'"
-        ) from None
 
 
 def _place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:

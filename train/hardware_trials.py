@@ -306,7 +306,6 @@ def _end_once(
     emulator: RunningEmulator, generator: np.random.Generator, end: Callable[[Any, int], None]
 ) -> float | None:
     """Time from the end of the program to torque off [s]; None if the motion had ended before."""
-    supervisor = None
     program = subprocess.Popen(
         [sys.executable, "-m", "train.wave", emulator.port, "1"], stdout=subprocess.PIPE, text=True,
         start_new_session=True,
@@ -334,17 +333,16 @@ def _end_once(
     finally:
         program.kill()
         program.communicate()
-        if supervisor is not None:
-            _wait_for_end(supervisor)
+        _wait_until_free(emulator.port)
 
 
-def _wait_for_end(process: int) -> None:
-    """Wait until a process that is no child has ended."""
+def _wait_until_free(port: str) -> None:
+    """Wait until the supervisor of a program that has ended has given the port back."""
     deadline = time.monotonic() + 5.0
-    with contextlib.suppress(ProcessLookupError):
-        while time.monotonic() < deadline:
-            os.kill(process, 0)
-            time.sleep(0.005)
+    while time.monotonic() < deadline:
+        with contextlib.suppress(PortError), Bus(port):
+            return
+        time.sleep(0.005)
 
 
 def unplugged(share: float) -> Trial:

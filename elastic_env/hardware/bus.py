@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dynamixel_sdk import COMM_SUCCESS
 
 from elastic_env.hardware import protocol
 from elastic_env.hardware.control_table import ServoModel, servo_model
 from elastic_env.hardware.errors import HardwareError, ReplyError
-from elastic_env.hardware.port import DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
+from elastic_env.hardware.port import COMM_SUCCESS, DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
 from elastic_env.signals import Array, BoolArray
 
 _TRIES = 3

@@ -93,13 +93,16 @@ class EmulatedServo:
             self._change("torque_enable", 0)
 
     def watch(self, now_s: float) -> None:
-        """Stop if the bus has been silent for longer than the watchdog allows (models that have one)."""
+        """Stop where it is if the bus has been silent for longer than the watchdog allows (models that have one).
+
+        Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus Watchdog).
+        """
         if not self.model.has_watchdog:
             return
         limit = self._get("bus_watchdog") * _WATCHDOG_UNIT_S
         if limit > 0.0 and now_s - self._heard_s > limit:
+            self._change("goal_position", self.present_position)
             self._change("bus_watchdog", _WATCHDOG_FIRED)
-            self._change("torque_enable", 0)
 
     def hear(self, now_s: float) -> None:
         """An instruction for anybody came over the bus."""
@@ -164,6 +167,8 @@ class EmulatedServo:
 
     def _refusal(self, register: Register, value: int) -> int:
         """Error number of a value that the servo does not take, 0 if it does."""
+        if register.name.startswith("goal_") and self._watchdog_has_fired:
+            return protocol.RANGE_ERROR
         if register.name == "goal_position":
             within = self._get("min_position_limit") <= value <= self._get("max_position_limit")
             return 0 if within else protocol.LIMIT_ERROR
@@ -186,6 +191,10 @@ class EmulatedServo:
             self.servo_id = value
         if name in _SWITCHES:
             self.notify(self.servo_id, name, value)
+
+    @property
+    def _watchdog_has_fired(self) -> bool:
+        return self.model.has_watchdog and self._get("bus_watchdog") == _WATCHDOG_FIRED
 
     @property
     def _alert(self) -> int:
