@@ -20,7 +20,7 @@ from elastic_env.hardware.safety import Guard, SafetyLimits
 from elastic_env.hardware.supervised import SupervisedBus
 
 PERIOD_S = 0.004
-PATIENT = SafetyLimits(patience_cycles=10)
+PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
 """Limits for tests of other things: a busy computer delays pseudo-terminals."""
 
 
@@ -103,9 +103,16 @@ def test_limits_in_the_wrong_order_are_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def emulator() -> Iterator[RunningEmulator]:
+def running() -> Iterator[RunningEmulator]:
     with RunningEmulator(EmulatorConfig(ids=(1, 2))) as running:
         yield running
+
+
+@pytest.fixture
+def emulator(running: RunningEmulator) -> RunningEmulator:
+    """The one emulator, without the faults that a test before may have left."""
+    running.faults(overload=False, late=0)
+    return running
 
 
 @pytest.fixture
@@ -185,7 +192,7 @@ def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator)
 
 def test_torque_is_off_when_the_program_waits_too_long(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
     """Catches a supervisor that waits for ever, and a program that is not told why nothing moves."""
-    supervised.enable(PATIENT)
+    supervised.enable(PATIENT.replace(hang_s=0.05))
     emulator.events()
     cycle(supervised, [0.0, 0.0], 3)
     last = time.monotonic()

@@ -24,18 +24,26 @@ from train.cli import main
 from train.hardware import hardware_arguments
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
-PATIENT = {"patience_cycles": 10}
+PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
 """A busy computer delays pseudo-terminals."""
 
 
 @pytest.fixture(scope="module")
-def emulator() -> Iterator[RunningEmulator]:
+def running() -> Iterator[RunningEmulator]:
     with RunningEmulator() as running:
         yield running
 
 
+@pytest.fixture
+def emulator(running: RunningEmulator) -> RunningEmulator:
+    """The one emulator, without the faults that a test before may have left."""
+    running.faults(imu_silent=False, imu_corrupted=0)
+    return running
+
+
 def make_hardware(emulator: RunningEmulator, **arguments: Any) -> Any:
-    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0, "limits": PATIENT, **arguments}
+    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0, "limits": PATIENT, "imu_oldest_s": 0.3}
+    given |= arguments
     return gymnasium.make("elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port, **given)
 
 
@@ -110,7 +118,6 @@ def test_a_stalled_imu_ends_the_episode_with_torque_off(emulator: RunningEmulato
     emulator.faults(imu_silent=True)
     with pytest.raises(AttitudeError, match="has sent no attitude"):
         _step_for(env, 1.0)
-    emulator.faults(imu_silent=False)
     assert emulator.state()["torque_on"] == [False]
 
 
@@ -122,13 +129,12 @@ def _step_for(env: Any, duration_s: float) -> None:
 
 def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: RunningEmulator) -> None:
     """Catches a wrong field or byte order, and a packet that is taken in spite of its checksum."""
-    with AttitudeStream(emulator.imu_port) as stream:
+    with AttitudeStream(emulator.imu_port, oldest_s=0.5) as stream:
         emulator.faults(imu_corrupted=0.5)
         rolls = []
         for _ in range(40):
             time.sleep(0.01)
             rolls.append(stream.latest().roll)
-        emulator.faults(imu_corrupted=0)
     assert np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01  # offset and noise of the scenario
     with pytest.raises(AttitudeError, match="/dev/ttyNOTHING"):
         AttitudeStream("/dev/ttyNOTHING")
@@ -152,7 +158,8 @@ def test_commands_run_on_hardware(
     residual = Path("baselines/trained/testbed/seed_0").absolute()
     monkeypatch.chdir(tmp_path)
     Path("mounting.yaml").write_text(
-        f"port: {emulator.port}\napproach_rad_s: 2.0\nlimits: {{patience_cycles: 10, slew_rad_s: 2.5}}\n"
+        f"port: {emulator.port}\napproach_rad_s: 2.0\nimu_oldest_s: 0.3\n"
+        "limits: {patience_cycles: 10, hang_s: 0.09, slew_rad_s: 2.5}\n"
     )
     options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
     assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5

@@ -78,7 +78,8 @@ def identification(share: float) -> Trial:
         real = gymnasium.make(
             "elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port,
             imu_port=emulator.imu_port, reference=hold, confirm=False, approach_rad_s=1.0,
-            limits={"patience_cycles": 10},  # here it is about K; a busy computer delays pseudo-terminals
+            # here it is about K; a busy computer delays pseudo-terminals
+            limits={"patience_cycles": 10}, imu_oldest_s=0.2,
         )  # fmt: skip
         try:
             (over_bus,), _ = identify([real], seed=0)

@@ -156,7 +156,7 @@ class ServoPlant:
         if self._bus is None:
             prefer_realtime()
             if settings.imu_port is not None:
-                self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate)
+                self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s)
             try:
                 self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
             except BaseException:

@@ -20,6 +20,7 @@ class HardwareSettings(Model):
     imu_port: str | None = None
     """Port of the IMU on the link; without one everything that needs the link angle is nan."""
     imu_baudrate: int = quantity("bit/s", 115_200, gt=0, description="rate of the IMU's port")
+    imu_oldest_s: float = quantity("s", 0.05, gt=0, le=1, description="age at which an attitude counts as missing")
     imu_axis: Literal["roll", "pitch", "yaw"] = "roll"
     """Euler angle that turns with the joint."""
     imu_sign: Literal[1, -1] = 1
