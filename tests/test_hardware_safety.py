@@ -111,7 +111,7 @@ def running() -> Iterator[RunningEmulator]:
 @pytest.fixture
 def emulator(running: RunningEmulator) -> RunningEmulator:
     """The one emulator, without the faults that a test before may have left."""
-    running.faults(overload=False, late=0)
+    running.faults(overload=False, late=0, latency_s=0)
     return running
 
 
@@ -151,6 +151,13 @@ def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -
         checks = check_bus(bus, [1, 2])
     assert [one.what for one in checks if not one.is_good and "round trip" not in one.what] == []
     assert any("54024 H54-200-S500-R" in one.value for one in checks)
+
+
+def test_slow_adapter_is_refused_with_its_cure(emulator: RunningEmulator) -> None:
+    """Catches a loop that would begin on an adapter as it is delivered: 16 ms, four control periods."""
+    emulator.faults(latency_s=0.016)
+    with pytest.raises(HardwareError, match=r"round trip .* is 1[67].*latency timer to 1 ms"):
+        SupervisedBus({emulator.port: [1]})
 
 
 def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator) -> None:

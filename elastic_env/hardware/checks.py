@@ -27,6 +27,8 @@ class Check:
     value: str
     cure: str = ""
     """What to do about it; empty where nothing is wrong."""
+    is_vital: bool = True
+    """Whether nothing may move before that is done."""
 
     @property
     def is_good(self) -> bool:
@@ -48,7 +50,7 @@ def check_bus(bus: Bus, ids: Sequence[int]) -> list[Check]:
     bus.attach(ids)
     checks = [_latency_timer(bus), _round_trip(bus, ids[0])]
     for servo_id, model in bus.models.items():
-        checks += [Check(f"{servo_id}: {one.what}", one.value, one.cure) for one in _check_servo(bus, servo_id, model)]
+        checks += [replace(one, what=f"{servo_id}: {one.what}") for one in _check_servo(bus, servo_id, model)]
     return checks
 
 
@@ -57,7 +59,7 @@ def _latency_timer(bus: Bus) -> Check:
     if latency is None:
         return Check("latency timer", "not an FTDI adapter, or not told; see the round trip")
     cure = "" if latency <= 1 else f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{bus.name[5:]}/latency_timer"
-    return Check("latency timer", f"{latency} ms", cure)
+    return Check("latency timer", f"{latency} ms", cure, is_vital=False)
 
 
 def _round_trip(bus: Bus, servo_id: int) -> Check:
@@ -83,11 +85,8 @@ def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
 
     volts, low, high = (get(n) / 10.0 for n in ("present_input_voltage", "min_voltage_limit", "max_voltage_limit"))
     degrees, hottest = get("present_temperature"), get("temperature_limit")
-    errors, mode, delay_s = (
-        get("hardware_error_status"),
-        get("operating_mode"),
-        _DELAY_UNIT_S * get("return_delay_time"),
-    )
+    errors, mode = get("hardware_error_status"), get("operating_mode")
+    delay_s = _DELAY_UNIT_S * get("return_delay_time")
     limit_a, needed_a = get(model.current_limit) * model.current_unit, current_of_torque(_TORQUE_NM)
     low_rad, high_rad = (get(n) * model.position_unit for n in ("min_position_limit", "max_position_limit"))
     write = "with torque off, write"
@@ -105,9 +104,10 @@ def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
               unless(get("status_return_level") == _FULL_REPLIES, "write 2 to status_return_level")),
         Check("current limit", f"{limit_a:.1f} A",
               unless(limit_a <= needed_a + 0.1, f"{write} {round(needed_a / model.current_unit)} to "
-                     f"{model.current_limit}: more than {_TORQUE_NM:g} N·m hurts the gear")),
+                     f"{model.current_limit}: more than {_TORQUE_NM:g} N·m hurts the gear"), is_vital=False),
         Check("position limits", f"{low_rad:.2f} to {high_rad:.2f} rad"),
         Check("torque", "on" if get("torque_enable") else "off",
-              unless(not get("torque_enable"), "a program left it on; it is switched off before anything begins")),
+              unless(not get("torque_enable"), "a program left it on; it is switched off before anything begins"),
+              is_vital=False),
         Check("bus watchdog", "yes" if model.has_watchdog else "not in this firmware; the supervisor stands in"),
     ]  # fmt: skip

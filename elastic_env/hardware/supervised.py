@@ -18,7 +18,7 @@ from elastic_env.hardware.port import DEFAULT_BAUDRATE
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.signals import Array, BoolArray
 
-_ERRORS = {"gone": BusGoneError, "fault": FaultError, "refused": ReplyError, "port": PortError}
+_ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
 _KEEP_ALIVE_S = 0.008
 
 
@@ -47,7 +47,7 @@ class SupervisedBus:
     Raises:
         PortError: A port cannot be had.
         ReplyError: A servo does not answer.
-        HardwareError: Its model is not known.
+        HardwareError: Its model is not known, or something is set such that nothing may move.
     """
 
     def __init__(self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> None:

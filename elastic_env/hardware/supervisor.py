@@ -21,6 +21,7 @@ import numpy as np
 
 from elastic_env.hardware.bus import Bus, Buses, States
 from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.control_table import explain_errors
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, ReplyError
 from elastic_env.hardware.realtime import prefer_realtime, sleep_until
@@ -73,17 +74,20 @@ class Supervisor:
         try:
             return actions[request["do"]](**request["with"])
         except BusGoneError as error:
-            self._guard = None
-            return {"error": "gone", "message": str(error)}
+            self._let_go()  # at the other buses, if there are any
+            return {"error": "BusGoneError", "message": str(error)}
         except HardwareError as error:
             if self._guard is not None:  # torque is still on
                 self._stop(str(error))
-                return {"error": "fault", "message": self._fault}
-            return {"error": "fault" if isinstance(error, FaultError) else "refused", "message": str(error)}
+                return {"error": "FaultError", "message": self._fault}
+            return {"error": type(error).__name__, "message": str(error)}
 
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
         for bus, own in zip(self._bus.buses, ids, strict=True):
-            bus.attach(own)
+            wrong = [check for check in check_bus(bus, own) if check.is_vital and not check.is_good]
+            if wrong:
+                problems = "; ".join(f"{check.what} is {check.value}: {check.cure}" for check in wrong)
+                raise HardwareError(f"nothing can move at {bus.name} yet: {problems}")
         return {"models": [[model.number for model in bus.models.values()] for bus in self._bus.buses]}
 
     def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
@@ -225,7 +229,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     except HardwareError as error:
         for bus in opened:
             bus.close()
-        channel.send({"number": 0, "error": "port", "message": str(error)})
+        channel.send({"number": 0, "error": "PortError", "message": str(error)})
         return
     channel.send({"number": 0, "is_realtime": is_realtime, "process": os.getpid()})
     Supervisor(channel, buses).run()
