@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from elastic_env.hardware.bus import Bus
 from elastic_env.hardware.control_table import ServoModel, explain_errors
