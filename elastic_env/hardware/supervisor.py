@@ -100,19 +100,11 @@ class Supervisor:
         guard = Guard(SafetyLimits(**limits), measured)
         self._fault = ""
         try:
-            for bus in self._bus.buses:
-                for servo_id, model in bus.models.items():
-                    if model.has_watchdog:
-                        bus.write(servo_id, "bus_watchdog", _WATCHDOG_CLEAR)
+            self._write("bus_watchdog", _WATCHDOG_CLEAR)
             self._bus.write_goals(measured)
-            for bus in self._bus.buses:
-                for servo_id in bus.ids:
-                    bus.write(servo_id, "torque_enable", 1)
+            self._write("torque_enable", 1)
             self._bus.write_goals(measured)
-            for bus in self._bus.buses:
-                for servo_id, model in bus.models.items():
-                    if model.has_watchdog:
-                        bus.write(servo_id, "bus_watchdog", _WATCHDOG_COUNTS)
+            self._write("bus_watchdog", _WATCHDOG_COUNTS)
         except BaseException:
             self._let_go()
             raise
@@ -120,6 +112,13 @@ class Supervisor:
         for bus in self._bus.buses:
             bus.port.reply_timeout_s = _REPLY_TIMEOUT_S
         return {"position": measured.tolist()}
+
+    def _write(self, name: str, value: int) -> None:
+        """Write a register of every servo that has it, each with its confirmation."""
+        for bus in self._bus.buses:
+            for servo_id, model in bus.models.items():
+                if name in model.table:
+                    bus.write(servo_id, name, value)
 
     def _exchange(self, goals: list[float], at: float) -> dict[str, Any]:
         """Command, wait for a moment, read; the moment is on the monotonic clock, which both processes share."""
@@ -197,7 +196,7 @@ class Supervisor:
             self._bus.torque_off()
             self._bus.torque_off()  # nobody confirms a packet to all; a second one costs nothing
             unconfirmed = self._bus.confirm_torque_off()
-        except BusGoneError as error:
+        except HardwareError as error:
             return str(error)
         if unconfirmed:
             return f"torque off was sent, but not confirmed by {', '.join(unconfirmed)}: switch the power off"
