@@ -449,7 +449,7 @@ class Emulate:
 class Prove:
     """Measure what driver, limits and supervisor do when things go wrong, against an emulated bus.
 
-    Long: about 20 minutes; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
+    Long: about 25 minutes; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
     """
 
     share: float = 1.0
