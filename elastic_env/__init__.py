@@ -17,6 +17,11 @@ gymnasium.register(
     vector_entry_point="elastic_env.entry_points:make_testbed_vector",
 )
 gymnasium.register(
+    id="elastic_env/HardwareTestbed-v0",
+    entry_point="elastic_env.hardware.entry_points:make_hardware_testbed",
+    vector_entry_point="elastic_env.hardware.entry_points:make_hardware_testbed_vector",
+)
+gymnasium.register(
     id="elastic_env/WalkInPlace-v0",
     entry_point="elastic_env.entry_points:make_walk",
     vector_entry_point="elastic_env.entry_points:make_walk_vector",

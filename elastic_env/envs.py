@@ -57,17 +57,24 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         task: The rules, for one world.
         render_mode: "rgb_array", "human" or None.
         picture: Makes the picture of the task when it is first rendered.
+        simulation: What moves instead of MuJoCo, such as hardware.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
 
-    def __init__(self, task: Task, render_mode: str | None, picture: Callable[[], Picture]) -> None:
+    def __init__(
+        self,
+        task: Task,
+        render_mode: str | None,
+        picture: Callable[[], Picture],
+        simulation: Simulation | None = None,
+    ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise unknown_name("render mode", render_mode, RENDER_MODES)
         self.render_mode = render_mode
         self.observation_space = task.observation_table.space(np.float64)
         self.action_space = task.action_table.space(np.float32)
-        self._worlds = Worlds(task, num_threads=1, is_scalar=True)
+        self._worlds = Worlds(task, num_threads=1, is_scalar=True, simulation=simulation)
         self._make_picture = picture
         self._picture: Picture | None = None
         self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
@@ -101,7 +108,8 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         return self._draw().rgb(self._worlds.signals()) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Close the window and free the renderer."""
+        """Close the window, free the renderer, let hardware go."""
+        self._worlds.simulation.close()
         if self._picture is not None:
             self._picture.close()
             self._picture = None
@@ -126,9 +134,16 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         task: The rules, for num_envs worlds.
         num_threads: Threads of the physics, 0 for all cores.
         autoreset_mode: Gymnasium's `AutoresetMode` or its value.
+        simulation: What moves instead of MuJoCo, such as hardware.
     """
 
-    def __init__(self, task: Task, num_threads: int = 0, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP):
+    def __init__(
+        self,
+        task: Task,
+        num_threads: int = 0,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        simulation: Simulation | None = None,
+    ) -> None:
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -139,7 +154,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         self.single_action_space = task.action_table.space(np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._worlds = Worlds(task, num_threads)
+        self._worlds = Worlds(task, num_threads, simulation=simulation)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
 
@@ -174,6 +189,10 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         else:
             observation, info = result.observation, _with_mask(result.info, done)
         return observation, result.reward, result.terminated, result.truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
+        """Let hardware go."""
+        self._worlds.simulation.close()
 
     def _begin(self, worlds: BoolArray) -> None:
         self._worlds.restart(worlds, self._generators)

@@ -52,6 +52,10 @@ class Simulation(Protocol):
         """Worlds in which MuJoCo warned of a bad number since their restart, (num_worlds,)."""
         ...
 
+    def close(self) -> None:
+        """Give back what it holds; hardware loses its torque."""
+        ...
+
 
 class SingleWorld:
     """One world on `mj_step`."""
@@ -97,6 +101,9 @@ class SingleWorld:
     def diverged(self) -> BoolArray:
         """See `Simulation`."""
         return np.array([bool(self._data.warning.number.any())])
+
+    def close(self) -> None:
+        """See `Simulation`; there is nothing to give back."""
 
 
 class ManyWorlds:
@@ -164,6 +171,9 @@ class ManyWorlds:
     def diverged(self) -> BoolArray:
         """See `Simulation`."""
         return self._batch.warning[..., 1].any(axis=1)
+
+    def close(self) -> None:
+        """See `Simulation`; there is nothing to give back."""
 
 
 def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:

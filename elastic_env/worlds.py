@@ -12,7 +12,7 @@ from elastic_env.errors import ActionError
 from elastic_env.metrics import EpisodeMetrics
 from elastic_env.rows import Rows
 from elastic_env.signals import Array, BoolArray, Signals
-from elastic_env.simulation import simulate
+from elastic_env.simulation import Simulation, simulate
 from elastic_env.step_info import StepInfo
 from elastic_env.tasks.task import Task
 
@@ -56,12 +56,15 @@ class Worlds:
         task: The rules.
         num_threads: Threads of the physics, 0 for all cores; results do not depend on it.
         is_scalar: Whether errors speak of one world, whose action has no axis of worlds.
+        simulation: What moves instead of MuJoCo, such as hardware.
     """
 
-    def __init__(self, task: Task, num_threads: int = 0, is_scalar: bool = False) -> None:
+    def __init__(
+        self, task: Task, num_threads: int = 0, is_scalar: bool = False, simulation: Simulation | None = None
+    ) -> None:
         self.task = task
         self._is_scalar = is_scalar
-        self.simulation = simulate(task.model, task.num_worlds, num_threads)
+        self.simulation = simulation or simulate(task.model, task.num_worlds, num_threads)
         self._bound = task.action_table.space(np.float32).high.astype(np.float64)
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
         self._samples: list[_Sample] = []

@@ -1,4 +1,4 @@
-"""The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, demo."""
+"""The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, hardware, demo."""
 
 import os
 import re
@@ -21,12 +21,37 @@ _CONSOLE = Console()
 
 
 @dataclass
+class OnHardware:
+    """Options of commands that run on the simulated testbed, or with --port on a real one."""
+
+    port: str | None = None
+    """Port of a real servo, such as /dev/ttyUSB0, in place of the simulation."""
+    imu_port: str | None = None
+    """Port of the IMU on its link."""
+    mounting: Path | None = None
+    """YAML file of signs, zeros, ids and limits of the real testbed, see docs/hardware.md."""
+    yes: bool = False
+    """Begin to move without asking."""
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the environment on hardware; empty for the simulation."""
+        if self.port is None and self.mounting is None and self.imu_port is None and not self.yes:
+            return {}
+        from train.hardware import hardware_arguments
+
+        return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
+
+
+@dataclass
 class Identify:
     """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
 
     Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and separates stiffness,
     friction, dead band and offset. Writes identification.json, which the environment and the compensators take as their
     K, and a figure. Example: elastic identify --scenario backlash
+
+    On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
     """
 
     scenario: str = "nominal"
@@ -43,13 +68,15 @@ class Identify:
     """Repeat with so many seeds and say how often the interval holds the true stiffness."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/identify, numbered if taken."""
+    on: OnHardware = field(default_factory=OnHardware)
 
     def run(self) -> None:
         """Identify, write, print."""
         from train.identify import IdentifyConfig, run_identification
 
         with _options_named():
-            config = IdentifyConfig(**{name: value for name, value in vars(self).items() if name != "output"})
+            given = {name: value for name, value in vars(self).items() if name not in ("output", "on")}
+            config = IdentifyConfig(**given, hardware=self.on.arguments)
         run_identification(config, _CONSOLE, self.output)
 
 
@@ -67,7 +94,7 @@ class Evaluate:
     zero, uncompensated, input, dynamic, oracle; on the walker also
     uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
-    """Environment: testbed (one joint) or walker (a humanoid that walks in place)."""
+    """Environment: testbed (one joint; with --port a real one) or walker (a humanoid that walks in place)."""
     scenario: str = "nominal"
     """Scenario, such as nominal, ideal, soft, stiff, payload, backlash,
     sensor, ideal+soft; on the walker also spread, push, slope."""
@@ -86,6 +113,7 @@ class Evaluate:
     such as '[1001]', twelve on the walker, or the path of an identification.json."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
+    on: OnHardware = field(default_factory=OnHardware)
 
     def run(self) -> None:
         """Evaluate as a comparison of one cell."""
@@ -93,10 +121,12 @@ class Evaluate:
         from train.conditions import PolicySpec
 
         options = {} if self.stiffness is None else {"stiffness": _stiffness(self.stiffness)}
+        arguments = self.on.arguments
         with _options_named():
             config = CompareConfig(
-                name="evaluate", env=self.env, references=[_motion(self.env, self.reference)],
-                scenarios=[self.scenario], policies=[PolicySpec(name=self.policy, options=options)],
+                name="evaluate", references=[_motion(self.env, self.reference)], **_place(self.env, arguments),
+                scenarios=["hardware" if arguments else self.scenario],
+                policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes, seed=self.seed,
             )  # fmt: skip
         _print_files(compare(config, _CONSOLE, self.output, report=False))
@@ -125,13 +155,19 @@ class Compare:
     output: Path | None = None
     """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
     jobs: int = 0
-    """Conditions that run at the same time, 0 for one per core."""
+    """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
+    on: OnHardware = field(default_factory=OnHardware)
 
     def run(self) -> None:
         """Compare."""
         from train.compare import CompareConfig, compare
 
-        _print_files(compare(load_yaml(self.config, CompareConfig), _CONSOLE, self.output, self.jobs))
+        config, arguments = load_yaml(self.config, CompareConfig), self.on.arguments
+        if arguments:
+            place = _place(config.env, arguments)
+            place["env_options"] = {**config.env_options, **place["env_options"]}
+            config = config.replace(scenarios=["hardware"], scenario_episodes={}, **place)
+        _print_files(compare(config, _CONSOLE, self.output, self.jobs))
 
 
 @dataclass
@@ -334,6 +370,155 @@ class Demo:
         demo(_CONSOLE, self.output)
 
 
+@dataclass
+class Scan:
+    """List the servos at a port, with model and firmware; nothing moves."""
+
+    port: Annotated[str, tyro.conf.Positional]
+    """Port, such as /dev/ttyUSB0."""
+    baudrate: int | None = None
+    """Bits per second; default: the usual rates, one after the other."""
+
+    def run(self) -> None:
+        """Scan."""
+        from train.hardware import scan
+
+        if not scan(self.port, self.baudrate, _CONSOLE):
+            sys.exit(1)
+
+
+@dataclass
+class Check:
+    """Look at port, servos and IMU before anything moves, and say what to do; exit code 1 where something is."""
+
+    port: Annotated[str, tyro.conf.Positional]
+    """Port, such as /dev/ttyUSB0."""
+    ids: list[int] = field(default_factory=lambda: [1])
+    """Ids of the servos."""
+    baudrate: int = 3_000_000
+    """Bits per second."""
+    imu_port: str | None = None
+    """Port of the IMU."""
+
+    def run(self) -> None:
+        """Check."""
+        from train.hardware import check
+
+        if not check(self.port, self.ids, self.baudrate, self.imu_port, _CONSOLE):
+            sys.exit(1)
+
+
+@dataclass
+class Run:
+    """Play one episode on the real testbed, show it as it goes, and keep every step.
+
+    Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input --reference sine
+    """
+
+    policy: str = "uncompensated"
+    """Baseline, residual:PATH, or "module:function" for one's own."""
+    reference: str | None = None
+    """Motion, as in elastic evaluate; default hold."""
+    output: Path | None = None
+    """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if taken."""
+    on: OnHardware = field(default_factory=OnHardware)
+
+    def run(self) -> None:
+        """Play."""
+        from train.conditions import PolicySpec
+        from train.hardware import run
+
+        if not (arguments := self.on.arguments):
+            raise ConfigurationError("--port is needed; see: elastic hardware scan, elastic hardware emulate")
+        path = run(arguments, _motion("hardware", self.reference), PolicySpec(name=self.policy), _CONSOLE, self.output)
+        _CONSOLE.print(f"wrote {path}", soft_wrap=True)
+
+
+@dataclass
+class Emulate:
+    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without hardware.
+
+    Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware emulate --lost 0.01
+    """
+
+    ids: list[int] = field(default_factory=lambda: [1])
+    """Ids of the servos; the IMU is on the link of the first."""
+    model_number: int = 54024
+    """Type of the servos: 54024, 54025 or 2020."""
+    scenario: str = "nominal"
+    """Scenario of the joint and of the IMU, as in elastic identify."""
+    stiffness: float | None = None
+    """K of the joint [N·m/rad]; default the paper's 1001."""
+    lost: float = 0.0
+    """Share of replies that do not come."""
+    late: float = 0.0
+    """Share of replies that come 6 ms late."""
+    corrupted: float = 0.0
+    """Share of replies with a flipped bit."""
+    truncated: float = 0.0
+    """Share of replies that end too early."""
+    latency_ms: float = 1.0
+    """Latency timer of the emulated USB adapter."""
+    seed: int = 0
+    """Seed of noise and faults."""
+
+    def run(self) -> None:
+        """Emulate."""
+        from elastic_env.entry_points import configure_testbed
+        from elastic_env.hardware.emulator.config import EmulatorConfig
+        from elastic_env.hardware.emulator.faults import Faults
+        from train.hardware import emulate
+
+        faults = Faults(
+            lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
+            latency_s=1e-3 * self.latency_ms,
+        )  # fmt: skip
+        config = EmulatorConfig(
+            ids=tuple(self.ids), model_number=self.model_number, faults=faults, seed=self.seed,
+            testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
+        )  # fmt: skip
+        emulate(config, _CONSOLE)
+
+
+@dataclass
+class Prove:
+    """Measure what driver, limits and supervisor do when things go wrong, against an emulated bus.
+
+    Long: about 25 minutes; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
+    """
+
+    share: float = 1.0
+    """Share of the repetitions and durations."""
+    only: list[str] = field(default_factory=list)
+    """Names of the measurements; default all."""
+    output: Path | None = None
+    """Folder for hardware.json, new or empty; default runs/prove, numbered if taken."""
+
+    def run(self) -> None:
+        """Measure."""
+        from train.prove_hardware import prove
+
+        if not prove(self.share, self.only, _CONSOLE, self.output):
+            sys.exit(1)
+
+
+@dataclass
+class Hardware:
+    """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate, prove."""
+
+    command: (
+        Annotated[Scan, tyro.conf.subcommand("scan")]
+        | Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Run, tyro.conf.subcommand("run")]
+        | Annotated[Emulate, tyro.conf.subcommand("emulate")]
+        | Annotated[Prove, tyro.conf.subcommand("prove")]
+    )
+
+    def run(self) -> None:
+        """Do what was asked for."""
+        self.command.run()
+
+
 Command = (
     Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
@@ -343,6 +528,7 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Play, tyro.conf.subcommand("play")]
+    | Annotated[Hardware, tyro.conf.subcommand("hardware")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 
@@ -353,6 +539,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
     command: Any = tyro.cli(
         Command, prog="elastic", args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
     )  # fmt: skip
     try:
@@ -363,6 +550,15 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted")
         os._exit(130)  # worker processes must not keep the terminal waiting
+
+
+def _place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed."""
+    if not arguments:
+        return {"env": env}
+    if env not in ("testbed", "hardware"):
+        raise ConfigurationError(f"--port is of the testbed, got the environment {env!r}")
+    return {"env": "hardware", "env_options": arguments}
 
 
 _PARAMETER = re.compile(r"^(?:(?:\w+Config|Condition)\.(\w+)|(reference)s?)(?:\.\d+)?(?=:| must be )", re.MULTILINE)

@@ -1,7 +1,7 @@
 """What the commands know of each environment: how it is made, what of it is kept, and how its figures are shown."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from elastic_env.errors import ConfigurationError, unknown_name
@@ -103,6 +103,7 @@ class Environment:
         curves: Signals over time in the report.
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
+        is_real: Whether it is hardware: one world at a time, in this process, without a truth to score by.
     """
 
     id: str
@@ -125,6 +126,7 @@ class Environment:
     learned_from: dict[str, Any] = field(default_factory=dict)
     quantity: str = ""
     failure: str = "fail"
+    is_real: bool = False
 
     def title(self, reference_name: str) -> str:
         """A reference's name as it stands in titles."""
@@ -266,5 +268,15 @@ _WALKER = Environment(
     failure="falls",
 )  # fmt: skip
 
-ENVIRONMENTS = {"testbed": _TESTBED, "walker": _WALKER}
+_HARDWARE = replace(
+    _TESTBED,
+    id="elastic_env/HardwareTestbed-v0",
+    columns=tuple(column for column in _TESTBED.columns if column.title != "est."),
+    traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
+    subject="link error by the IMU",
+    note="On hardware: IMU- and IMU+ are the range; there is no truth to score an estimate by.",
+    is_real=True,
+)
+
+ENVIRONMENTS = {"testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE}
 """Environments by the short names of the command line."""

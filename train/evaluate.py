@@ -114,8 +114,12 @@ def make_vector_env(
 def num_steps(condition: Condition) -> int:
     """Control steps that all episodes of a condition take, for progress bars."""
     env = make_vector_env(condition, 1)
-    batches = -(-condition.episodes // _MAX_WORLDS)
+    batches = -(-condition.episodes // _worlds_at_once(condition))
     return batches * env.unwrapped.task.num_steps
+
+
+def _worlds_at_once(condition: Condition) -> int:
+    return 1 if condition.environment.is_real else _MAX_WORLDS
 
 
 def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
@@ -127,8 +131,9 @@ def evaluate(condition: Condition, progress: Progress | None = None, num_threads
         num_threads: Threads of the physics, 0 for all cores.
     """
     result = Evaluation(condition)
-    for first in range(0, condition.episodes, _MAX_WORLDS):
-        worlds = min(_MAX_WORLDS, condition.episodes - first)
+    at_once = _worlds_at_once(condition)
+    for first in range(0, condition.episodes, at_once):
+        worlds = min(at_once, condition.episodes - first)
         _play(condition, first, worlds, num_threads, result, progress)
     return result
 
@@ -138,10 +143,20 @@ def _play(
 ) -> None:
     """One batch of worlds, each until the end of its first episode."""
     env = make_vector_env(condition, worlds, num_threads)
+    try:
+        _play_in(env, condition, first, worlds, result, progress)
+    finally:
+        env.close()
+
+
+def _play_in(
+    env: Any, condition: Condition, first: int, worlds: int, result: Evaluation, progress: Progress | None
+) -> None:
     policy = make_policy(condition.policy, env, condition.policy_options)
     task = env.unwrapped.task
     keeper = _FirstWorld(task, condition.environment.traced) if first == 0 else None
-    estimates = _Estimates(task, worlds) if hasattr(policy, "link_estimate") else None
+    is_scored = hasattr(policy, "link_estimate") and not condition.environment.is_real
+    estimates = _Estimates(task, worlds) if is_scored else None
     observation, info = env.reset(seed=condition.seed + first)
     records: list[dict[str, Any] | None] = [None] * worlds
     state, episode_start, step, reported = None, np.ones(worlds, dtype=np.bool_), 0, 0

@@ -31,6 +31,10 @@ class IdentifyConfig(Model):
     positions: int = quantity("1", 20, ge=5, description="number of static positions")
     seed: int = quantity("1", 0, ge=0, description="seed of the first run")
     repeats: int = quantity("1", 1, ge=1, description="number of runs with seeds of their own")
+    hardware: dict[str, Any] = {}
+    """Arguments of `elastic_env/HardwareTestbed-v0` for a real joint; empty for a simulated one."""
+    hold: dict[str, Any] = {}
+    """Parameters of the reference `hold` beside the number of positions."""
 
     @model_validator(mode="after")
     def _masses_differ(self) -> Self:
@@ -38,9 +42,21 @@ class IdentifyConfig(Model):
             raise ValueError("second_mass must differ from 1: two equal masses do not separate anything")
         return self
 
+    @model_validator(mode="after")
+    def _hardware_is_one_joint_with_an_imu(self) -> Self:
+        if not self.hardware:
+            return self
+        if self.hardware.get("imu_port") is None:
+            raise ValueError("an identification on hardware needs the link's angle: name the IMU with --imu-port")
+        if self.stiffness is not None or self.repeats > 1:
+            raise ValueError("stiffness and repeats are of a simulated joint; leave them out on hardware")
+        if self.second_mass is not None and not self.hardware.get("confirm", True):
+            raise ValueError("somebody must change the mass between the runs: a second_mass excludes --yes")
+        return self
+
 
 def run_identification(config: IdentifyConfig, console: Console, output: Path | None = None) -> list[Identification]:
-    """Identify the simulated testbed, write `identification.json` and the figure, print the result.
+    """Identify the testbed, simulated or real, write `identification.json` and the figure, print the result.
 
     Args:
         config: What to do.
@@ -60,6 +76,8 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
         columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task("visiting static positions", total=1.0)
+            if config.hardware:
+                bar.stop()  # somebody may be asked something
             results, points = identify(envs, config.seed, lambda share: bar.update(task, completed=share))
         results[0].save(folder / "identification.json")
         models = [env.unwrapped.assumed_model for env in envs]
@@ -99,13 +117,22 @@ def result_table(result: Identification) -> Table:
 
 
 def _environments(config: IdentifyConfig) -> list[Any]:
+    reference = {"kind": "hold", "positions": config.positions, **config.hold}
     pendulums = [Pendulum()]
     if config.second_mass is not None:
         pendulums.append(Pendulum().with_mass_scaled(config.second_mass))
+    if config.hardware:
+        return [
+            gymnasium.make_vec(
+                "elastic_env/HardwareTestbed-v0", num_envs=1, vectorization_mode="vector_entry_point",
+                reference=reference, pendulum=pendulum, **config.hardware,
+            )
+            for pendulum in pendulums
+        ]  # fmt: skip
     return [
         gymnasium.make_vec(
             "elastic_env/Testbed-v0", num_envs=config.repeats, vectorization_mode="vector_entry_point",
-            reference={"kind": "hold", "positions": config.positions}, scenario=config.scenario,
+            reference=reference, scenario=config.scenario,
             stiffness=config.stiffness, pendulum=pendulum,
         )
         for pendulum in pendulums

@@ -19,8 +19,11 @@ from train.evaluate import Evaluation, evaluate, num_steps
 def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    The results do not depend on the number of processes.
+    The results do not depend on the number of processes. On hardware the conditions come one after the other, in this
+    process, at whose terminal somebody can agree to them.
     """
+    if any(condition.environment.is_real for condition in conditions):
+        return [evaluate(condition) for condition in conditions]
     steps = [num_steps(condition) for condition in conditions]
     longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
     with progress_bar(console, transient=True) as bar:

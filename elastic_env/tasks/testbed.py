@@ -135,7 +135,7 @@ class TestbedTask:
         self._reference = PlanTable(config.reference, config.control_period_s, num_worlds)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._theta, self._theta_dot, self._q, self._q_dot = np.zeros((4, num_worlds))
-        self._measured = self._shown = _Measurement(*np.zeros((3, num_worlds)))
+        self._measured = self._shown = Measurement(*np.zeros((3, num_worlds)))
         self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds))
         self._offset, self._offset_before, self._command = np.zeros((3, num_worlds))
 
@@ -159,7 +159,7 @@ class TestbedTask:
         self._place(simulation, worlds)
         self._read(simulation, worlds)
         fresh = self._measure(worlds)
-        at_rest = _Measurement(fresh.encoder, fresh.encoder, fresh.imu)
+        at_rest = Measurement(fresh.encoder, fresh.encoder, fresh.imu)
         self._measured = self._measured.with_worlds(worlds, at_rest)
         self._shown = self._shown.with_worlds(worlds, at_rest)
 
@@ -267,13 +267,13 @@ class TestbedTask:
         self._q = np.where(worlds, qpos[:, at.q[0]], self._q)
         self._q_dot = np.where(worlds, qvel[:, at.q_dot[0]], self._q_dot)
 
-    def _measure(self, worlds: BoolArray) -> "_Measurement":
+    def _measure(self, worlds: BoolArray) -> "Measurement":
         """What the sensors say now; the other worlds keep their last values."""
         scenario, last = self.config.scenario, self._measured
         counts = self._joint.encoder_counts_per_turn if scenario.encoder_counts else None
         due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
         imu = attitude(scenario.imu, self._q, self._imu_bias, self._noise.next(due)[:, 0])
-        return _Measurement(
+        return Measurement(
             encoder=np.where(worlds, quantise(self._theta + self._encoder_bias, counts), last.encoder),
             encoder_before=np.where(worlds, last.encoder, last.encoder_before),
             imu=np.where(due, imu, last.imu),
@@ -281,7 +281,7 @@ class TestbedTask:
 
 
 @dataclass(frozen=True, slots=True)
-class _Measurement(Rows):
+class Measurement(Rows):
     """Sensor values, (num_worlds,) each [rad]; the encoder also a control period earlier."""
 
     encoder: Array

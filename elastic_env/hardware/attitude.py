@@ -1,0 +1,151 @@
+"""The link's attitude from a MicroStrain IMU, read by a process of its own; a stream that stalls is an error.
+
+The maker's library keeps Python's lock while it waits, which would hold the control loop up, hence the process. The
+newest sample lies in shared memory with its time; a counter around each write, odd while it lasts, keeps halves of two
+samples apart.
+"""
+
+import math
+import mmap
+import os
+import struct
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+from elastic_env.hardware.errors import HardwareError
+
+_COUNTER = struct.Struct("=q")
+_SAMPLE = struct.Struct("=dddd")
+_SIZE = _COUNTER.size + _SAMPLE.size
+
+Axis = Literal["roll", "pitch", "yaw"]
+
+
+class AttitudeError(HardwareError):
+    """The IMU cannot be opened, sends nothing, or has stopped sending."""
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """One sample: Euler angles of the maker's north-east-down convention [rad], and when it came in [s, monotonic]."""
+
+    time_s: float
+    roll: float
+    pitch: float
+    yaw: float
+
+
+class SharedSample:
+    """The newest sample, written by one process and read by another.
+
+    Args:
+        descriptor: File of the memory, from `SharedSample.file`.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._memory = mmap.mmap(descriptor, _SIZE)
+
+    @staticmethod
+    def file() -> int:
+        """New memory for a sample."""
+        descriptor = os.memfd_create("attitude")
+        os.ftruncate(descriptor, _SIZE)
+        return descriptor
+
+    def put(self, sample: Attitude) -> None:
+        """Replace the sample."""
+        (counter,) = _COUNTER.unpack_from(self._memory)
+        _COUNTER.pack_into(self._memory, 0, counter + 1)
+        _SAMPLE.pack_into(self._memory, _COUNTER.size, sample.time_s, sample.roll, sample.pitch, sample.yaw)
+        _COUNTER.pack_into(self._memory, 0, counter + 2)
+
+    def get(self) -> Attitude | None:
+        """The newest sample; None before the first."""
+        while True:
+            (before,) = _COUNTER.unpack_from(self._memory)
+            values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
+            (after,) = _COUNTER.unpack_from(self._memory)
+            if before == after and before % 2 == 0:
+                return Attitude(*values) if before else None
+
+
+class AttitudeStream:
+    """Reads an IMU that streams its filter's Euler angles (MIP set 0x82, field 0x05).
+
+    Args:
+        port: Device, such as /dev/ttyACM0.
+        baudrate: Bits per second.
+        oldest_s: Age at which a sample counts as missing [s].
+        wait_s: How long to wait for the first one [s].
+
+    Raises:
+        AttitudeError: The port cannot be opened, or nothing comes.
+    """
+
+    def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 3.0) -> None:
+        self.port, self._oldest_s = port, oldest_s
+        file = SharedSample.file()
+        self._shared = SharedSample(file)
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)],
+            pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+        os.close(file)
+        deadline = time.monotonic() + wait_s
+        while self._shared.get() is None:
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                error = self._silent()
+                self.close()
+                raise error
+            time.sleep(0.01)
+
+    def latest(self) -> Attitude:
+        """The newest sample.
+
+        Raises:
+            AttitudeError: It is too old: the stream has stopped.
+        """
+        sample = self._shared.get()
+        if sample is None or time.monotonic() - sample.time_s > self._oldest_s:
+            raise self._silent(sample)
+        return sample
+
+    def close(self) -> None:
+        """End the reader."""
+        for pipe in (self._process.stdin, self._process.stderr):
+            if pipe is not None:
+                pipe.close()
+        try:
+            self._process.wait(timeout=2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self) -> "AttitudeStream":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _silent(self, last: Attitude | None = None) -> AttitudeError:
+        if self._process.poll() is not None and self._process.stderr is not None:
+            said = self._process.stderr.read().strip().splitlines()
+            return AttitudeError(f"the IMU at {self.port} cannot be read: {said[-1] if said else 'its reader ended'}")
+        if last is None:
+            return AttitudeError(
+                f"the IMU at {self.port} sends no attitude; it must stream its filter's Euler angles (set 0x82, field "
+                "0x05) at 100 Hz or more, at this baud rate"
+            )
+        return AttitudeError(
+            f"the IMU at {self.port} has sent no attitude for {1e3 * (time.monotonic() - last.time_s):.0f} ms, "
+            f"{1e3 * self._oldest_s:.0f} ms are allowed"
+        )
+
+
+def link_angle(sample: Attitude, axis: Axis, sign: int, offset_rad: float) -> float:
+    """Link angle [rad], from −π to π: sign · Euler angle − offset."""
+    angle = sign * getattr(sample, axis) - offset_rad
+    return math.remainder(angle, 2.0 * math.pi)

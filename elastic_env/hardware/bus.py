@@ -1,0 +1,337 @@
+"""Servos on one port, in SI units: registers, the goals of all servos in one packet, their states in another.
+
+A state is read as one block per servo. Each request asks for another length than the last ones
+(`ServoModel.block_lengths`), so that a reply that comes late is known as old and left out, not taken for the next one.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from elastic_env.hardware import protocol
+from elastic_env.hardware.control_table import ServoModel, servo_model
+from elastic_env.hardware.errors import HardwareError, ReplyError
+from elastic_env.hardware.port import COMM_SUCCESS, DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
+from elastic_env.signals import Array, BoolArray
+
+_TRIES = 3
+_QUIET_S = 0.03
+
+
+@dataclass(frozen=True)
+class States:
+    """What the servos of a bus replied in one cycle, (n,) each, in the order of their ids.
+
+    Where a servo's reply is missing its numbers are nan, never old ones.
+    """
+
+    position: Array
+    """[rad], in the servo's own zero and sign."""
+    velocity: Array
+    """[rad/s]"""
+    current: Array
+    """Signed motor current [A]."""
+    is_fresh: BoolArray
+    """Whether the servo answered this very request, whole and intact."""
+    has_alert: BoolArray
+    """Whether it reports a hardware error."""
+    time_s: float
+    """When the replies were in, on the monotonic clock."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A servo that answered a scan."""
+
+    servo_id: int
+    model_number: int
+    firmware: int
+
+
+class Bus:
+    """Servos on a port.
+
+    Args:
+        port: Device, such as /dev/ttyUSB0.
+        baudrate: Bits per second.
+    """
+
+    def __init__(self, port: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
+        self.name = port
+        self.port = Port(port, baudrate)
+        self.models: dict[int, ServoModel] = {}
+        self._handler = PacketHandler()
+        self._requests = 0
+
+    def open(self) -> None:
+        """Open and lock the port.
+
+        Raises:
+            PortError: It cannot be had.
+        """
+        self.port.open()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.port.closePort()
+
+    def __enter__(self) -> "Bus":
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Ids of the attached servos, in order."""
+        return tuple(self.models)
+
+    def scan(self) -> list[Found]:
+        """All servos that answer a broadcast ping, by id."""
+        with bus_gone(self.name):
+            found, _ = self._handler.broadcastPing(self.port)
+        return [Found(servo_id, *values) for servo_id, values in sorted(found.items())]
+
+    def ping(self, servo_id: int) -> Found:
+        """Model number and firmware of one servo.
+
+        Raises:
+            ReplyError: It does not answer.
+        """
+        reply = self._asked(servo_id, protocol.PING, b"", 3)
+        return Found(servo_id, int.from_bytes(reply[:2], "little"), reply[2])
+
+    def attach(self, ids: Sequence[int]) -> None:
+        """Take servos into the cycle; each is asked for its model, which decides on its registers.
+
+        Raises:
+            ReplyError: A servo does not answer.
+            HardwareError: Its model is not known.
+        """
+        self.models = {servo_id: servo_model(self.ping(servo_id).model_number) for servo_id in ids}
+        if len({model.block_address for model in self.models.values()}) > 1:
+            names = ", ".join(f"{servo_id}: {model.name}" for servo_id, model in self.models.items())
+            raise HardwareError(f"the servos of one bus must have one control table, at {self.name} are {names}")
+
+    def read(self, servo_id: int, name: str) -> int:
+        """A register [count].
+
+        Raises:
+            ReplyError: No answer in three tries, or a refusal.
+        """
+        register = self.models[servo_id].table[name]
+        asked = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
+        return register.decode(self._asked(servo_id, protocol.READ, asked, register.size))
+
+    def write(self, servo_id: int, name: str, value: int) -> None:
+        """Write a register [count].
+
+        Raises:
+            ReplyError: No answer in three tries, or a refusal, with the servo's reason.
+        """
+        register = self.models[servo_id].table[name]
+        data = register.address.to_bytes(2, "little") + register.encode(value)
+        self._asked(servo_id, protocol.WRITE, data, 0)
+
+    def position(self, servo_id: int) -> float:
+        """Present position of one servo [rad]."""
+        return self.read(servo_id, "present_position") * self.models[servo_id].position_unit
+
+    def write_all(self, name: str, values: Mapping[int, int]) -> None:
+        """Write a register of several servos in one packet, which nobody confirms.
+
+        Raises:
+            BusGoneError: The port is gone.
+        """
+        if not values:
+            return
+        register = self.models[next(iter(values))].table[name]
+        data = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
+        data += b"".join(bytes([servo_id]) + register.encode(value) for servo_id, value in values.items())
+        self._send(protocol.BROADCAST, protocol.SYNC_WRITE, data)
+        self.port.release()
+
+    def write_goals(self, angles: Array) -> None:
+        """Command all servos at once.
+
+        Args:
+            angles: Goal positions in the order of `ids`, (n,) [rad].
+        """
+        units = np.array([model.position_unit for model in self.models.values()])
+        counts = np.rint(angles / units).astype(np.int64).tolist()
+        self.write_all("goal_position", dict(zip(self.ids, counts, strict=True)))
+
+    def torque_off(self) -> None:
+        """Switch all torque off in one packet; also after a read that was interrupted.
+
+        Raises:
+            BusGoneError: The port is gone.
+        """
+        self.port.release()
+        self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
+
+    def confirm_torque_off(self) -> list[str]:
+        """Servos that do not say that their torque is off, after some tries each."""
+        return [f"servo {i} at {self.name}" for i in self.ids if not self._is_off(i)]
+
+    def _is_off(self, servo_id: int) -> bool:
+        try:
+            if self.read(servo_id, "torque_enable") == 0:
+                return True
+            self.write(servo_id, "torque_enable", 0)
+        except ReplyError:
+            return False
+        return True
+
+    def read_states(self, timeout_s: float) -> States:
+        """Position, velocity and current of all servos.
+
+        Args:
+            timeout_s: How long to wait for all replies together.
+
+        Raises:
+            BusGoneError: The port is gone.
+        """
+        self._requests += 1
+        some = next(iter(self.models.values()))
+        length = some.block_lengths[self._requests % len(some.block_lengths)]
+        asked = some.block_address.to_bytes(2, "little") + length.to_bytes(2, "little")
+        self._send(protocol.BROADCAST, protocol.SYNC_READ, asked + bytes(self.ids))
+        self.port.setPacketTimeoutMillis(1e3 * timeout_s)
+        blocks: dict[int, bytes] = {}
+        alerts: set[int] = set()
+        while len(blocks) < len(self.ids):
+            reply = self._receive()
+            if reply is None:
+                if self.port.getTimeSinceStart() >= 1e3 * timeout_s:
+                    break
+                continue
+            servo_id, error, data = reply
+            if error & protocol.ALERT:
+                alerts.add(servo_id)
+            if len(data) == length and error & ~protocol.ALERT == 0 and servo_id in self.models:
+                blocks[servo_id] = data
+        return self._states(blocks, alerts)
+
+    def _states(self, blocks: Mapping[int, bytes], alerts: set[int]) -> States:
+        values = np.full((3, len(self.ids)), np.nan)
+        for column, (servo_id, model) in enumerate(self.models.items()):
+            if servo_id in blocks:
+                values[0, column] = model.in_block("present_position", blocks[servo_id]) * model.position_unit
+                values[1, column] = model.in_block("present_velocity", blocks[servo_id]) * model.velocity_unit
+                values[2, column] = model.in_block("present_current", blocks[servo_id]) * model.current_unit
+        is_fresh = np.array([servo_id in blocks for servo_id in self.ids])
+        has_alert = np.array([servo_id in alerts for servo_id in self.ids])
+        return States(*values, is_fresh=is_fresh, has_alert=has_alert, time_s=time.monotonic())
+
+    def _asked(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
+        """The data of a reply; a few tries, with silence in between so that no late reply answers the next one."""
+        for _ in range(_TRIES):
+            self._send(servo_id, instruction, parameters)
+            self.port.setPacketTimeout(11 + length)
+            while (reply := self._receive()) is not None:
+                answered, error, data = reply
+                reason = protocol.STATUS_ERRORS.get(error & ~protocol.ALERT)
+                if answered == servo_id and reason is not None:
+                    raise ReplyError(f"servo {servo_id} at {self.name} refuses: {reason}")
+                if answered == servo_id and len(data) == length:
+                    return data
+            self._wait_for_silence()
+        raise ReplyError(
+            f"servo {servo_id} at {self.name} does not answer ({self.port.baudrate} bit/s); check power, wiring, id "
+            "and baud rate, see: elastic hardware scan"
+        )
+
+    def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+        laid_out = [0] * (10 + len(parameters))
+        length = len(parameters) + 3
+        laid_out[4:8] = [servo_id, length & 0xFF, length >> 8, instruction]
+        laid_out[8:-2] = parameters
+        self.port.release()
+        with bus_gone(self.name):
+            result = self._handler.txPacket(self.port, laid_out)
+        if result != COMM_SUCCESS:
+            raise ReplyError(f"cannot send at {self.name}: {self._handler.getTxRxResult(result)}")
+
+    def _receive(self) -> tuple[int, int, bytes] | None:
+        """Id, error and data of the next status; None if it is damaged, or none comes in time."""
+        with bus_gone(self.name):
+            received, result = self._handler.rxPacket(self.port, False)
+        if result != COMM_SUCCESS:
+            return None
+        return received[4], received[8], bytes(received[9:-2])
+
+    def _wait_for_silence(self) -> None:
+        with bus_gone(self.name):
+            self.port.release()
+            quiet_since = time.monotonic()
+            deadline = quiet_since + 10 * _QUIET_S
+            while time.monotonic() - quiet_since < _QUIET_S and time.monotonic() < deadline:
+                if self.port.readPort(256):
+                    quiet_since = time.monotonic()
+
+
+class Buses:
+    """Several buses as one: each has a reader of its own, so that they work at the same time.
+
+    Args:
+        buses: With their servos attached; an array of all servos has theirs in this order.
+    """
+
+    def __init__(self, buses: Sequence[Bus]) -> None:
+        self.buses = tuple(buses)
+        self._readers = [ThreadPoolExecutor(1, thread_name_prefix=bus.name) for bus in buses[1:]]
+
+    @property
+    def num_servos(self) -> int:
+        """How many servos there are on all of them."""
+        return sum(len(bus.ids) for bus in self.buses)
+
+    def write_goals(self, angles: Array) -> None:
+        """Command all servos, (n,) [rad]."""
+        ends = np.cumsum([len(bus.ids) for bus in self.buses])[:-1]
+        self._on_each(lambda bus, part: bus.write_goals(part), np.split(angles, ends))
+
+    def read_states(self, timeout_s: float) -> States:
+        """The states of all servos; the time is that of the last reply."""
+        parts = self._on_each(lambda bus, _: bus.read_states(timeout_s))
+        names = ("position", "velocity", "current", "is_fresh", "has_alert")
+        joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        return States(*joined, time_s=max(part.time_s for part in parts))
+
+    def torque_off(self) -> None:
+        """Switch all torque off; a bus that is gone does not keep the others from it.
+
+        Raises:
+            BusGoneError: A bus is gone; all others are off.
+        """
+        self._on_each(lambda bus, _: bus.torque_off())
+
+    def confirm_torque_off(self) -> list[str]:
+        """Servos that do not say that their torque is off."""
+        return [name for names in self._on_each(lambda bus, _: bus.confirm_torque_off()) for name in names]
+
+    def close(self) -> None:
+        """Give all ports back."""
+        for reader in self._readers:
+            reader.shutdown()
+        for bus in self.buses:
+            bus.close()
+
+    def _on_each(self, function: Callable[[Bus, Any], Any], parts: Sequence[Any] | None = None) -> list[Any]:
+        """Call a function for every bus, the first in this thread; all of them are done when an error is raised."""
+        given = [None] * len(self.buses) if parts is None else parts
+        waiting = [
+            reader.submit(function, bus, part)
+            for reader, bus, part in zip(self._readers, self.buses[1:], given[1:], strict=True)
+        ]
+        try:
+            first = function(self.buses[0], given[0])
+        finally:
+            wait(waiting)
+        return [first, *(future.result() for future in waiting)]

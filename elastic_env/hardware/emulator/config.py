@@ -1,0 +1,37 @@
+"""What an emulator emulates."""
+
+from typing import Self
+
+from pydantic import model_validator
+
+from elastic_env.config import Model, quantity
+from elastic_env.hardware.control_table import servo_model
+from elastic_env.hardware.emulator.faults import Faults
+from elastic_env.hardware.protocol import LARGEST_ID
+from elastic_env.tasks.testbed_config import TestbedConfig
+
+
+class EmulatorConfig(Model):
+    """An emulated bus with its servos, and the IMU on the link of the first."""
+
+    model_number: int = 54024
+    """Type of the servos."""
+    claimed_model_number: int | None = None
+    """Model number that they report, if it is to be a wrong one."""
+    ids: tuple[int, ...] = (1,)
+    """Their ids."""
+    testbed: TestbedConfig = TestbedConfig()
+    """The joints behind them, and through its scenario the quality of the IMU."""
+    imu_rate_hz: float = quantity("Hz", 100.0, gt=0, le=1000, description="packets of the IMU per second")
+    baudrate: int = quantity("bit/s", 3_000_000, gt=0, description="rate by which replies take their time")
+    return_delay_s: float = quantity("s", 0.0, ge=0, lt=1e-3, description="delay before each reply, as it is set")
+    faults: Faults = Faults()
+    seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
+
+    @model_validator(mode="after")
+    def _servos_exist(self) -> Self:
+        servo_model(self.model_number)
+        wrong = [i for i in self.ids if not 0 <= i <= LARGEST_ID]
+        if wrong or not self.ids or len(set(self.ids)) != len(self.ids):
+            raise ValueError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {self.ids}")
+        return self

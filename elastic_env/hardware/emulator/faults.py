@@ -1,0 +1,55 @@
+"""What can go wrong on a bus, by switch: for trying out what a program does about it."""
+
+from typing import Any
+
+import numpy as np
+
+from elastic_env.config import Model, quantity
+
+
+class Faults(Model):
+    """Faults of an emulated bus; all of them off by default. Shares are drawn per reply."""
+
+    lost: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that do not come")
+    late: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that come late")
+    late_s: float = quantity("s", 0.006, ge=0, description="how late")
+    corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of replies with a flipped bit")
+    truncated: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that end too early")
+    latency_s: float = quantity("s", 0.0, ge=0, description="delay of every reply: the adapter's latency timer")
+    overload: bool = False
+    """Whether the servos report an overload and let go."""
+    silent: bool = False
+    """Whether the servos hear but do not answer."""
+    unplugged: bool = False
+    """Whether the port is gone."""
+    imu_silent: bool = False
+    """Whether the IMU sends nothing."""
+    imu_corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of IMU packets with a flipped bit")
+
+
+def damage(faults: Faults, reply: bytes, generator: np.random.Generator) -> tuple[bytes, float]:
+    """What becomes of a reply: its bytes, none if it is lost, and its delay [s]."""
+    delay = faults.latency_s
+    chance = generator.random(4)
+    if faults.silent or chance[0] < faults.lost:
+        return b"", 0.0
+    if chance[1] < faults.late:
+        delay += faults.late_s
+    if chance[2] < faults.corrupted:
+        reply = flip_bit(reply, generator)
+    if chance[3] < faults.truncated:
+        reply = reply[: int(generator.integers(1, len(reply)))]
+    return reply, delay
+
+
+def flip_bit(data: bytes, generator: np.random.Generator) -> bytes:
+    """The same bytes with one bit inverted."""
+    changed = bytearray(data)
+    bit = int(generator.integers(8 * len(data)))
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def changed(faults: Faults, changes: dict[str, Any]) -> Faults:
+    """Faults with some of them changed, validated."""
+    return faults.replace(**changes)

@@ -1,0 +1,230 @@
+"""The emulator's own process: pseudo-terminals in real time, and a line-based channel for faults and events."""
+
+import contextlib
+import fcntl
+import json
+import os
+import pty
+import select
+import struct
+import sys
+import termios
+import time
+import tty
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from elastic_env.hardware import protocol
+from elastic_env.hardware.control_table import servo_model
+from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.faults import changed, damage, flip_bit
+from elastic_env.hardware.emulator.joints import Joints
+from elastic_env.hardware.emulator.mip import attitude_packet
+from elastic_env.hardware.emulator.servo import EmulatedServo, JointState
+from elastic_env.hardware.emulator.wire import EmulatedBus
+from elastic_env.hardware.realtime import prefer_realtime
+from elastic_env.sensors import attitude
+
+_PHYSICS_S = 2e-3
+_UNREAD_BYTES = 2000
+_KEPT_EVENTS = 100_000
+
+
+@dataclass
+class Terminal:
+    """A pseudo-terminal; programs open its name as they would a serial port."""
+
+    master: int
+    slave: int
+    name: str
+
+    @staticmethod
+    def opened() -> "Terminal":
+        """A new one, which passes bytes through as they are."""
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        return Terminal(master, slave, os.ttyname(slave))
+
+    def write(self, data: bytes) -> None:
+        """Pass bytes on; they are lost where nobody has read what is there, as on a line to nobody."""
+        unread = struct.unpack("i", fcntl.ioctl(self.slave, termios.FIONREAD, b"\0\0\0\0"))[0]
+        if unread > _UNREAD_BYTES:
+            termios.tcflush(self.slave, termios.TCIFLUSH)
+        with contextlib.suppress(OSError):
+            os.write(self.master, data)
+
+    def read(self) -> bytes:
+        """What has come."""
+        with contextlib.suppress(OSError):
+            return os.read(self.master, 4096)
+        return b""
+
+    def close(self) -> None:
+        """Take it away, as an unplugged adapter is."""
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@dataclass
+class Emulator:
+    """Servos, joints and IMU behind two pseudo-terminals.
+
+    Attributes:
+        config: What is emulated.
+    """
+
+    config: EmulatorConfig
+    events: deque[tuple[float, int, str, int]] = field(default_factory=lambda: deque(maxlen=_KEPT_EVENTS))
+    """When, at which servo, which register became what: torque, goal and watchdog; and which position was asked for."""
+
+    def __post_init__(self) -> None:
+        config, model = self.config, servo_model(self.config.model_number)
+        self.bus_terminal: Terminal | None = Terminal.opened()
+        self.imu_terminal = Terminal.opened()
+        self.faults = config.faults
+        self._generator = np.random.default_rng(config.seed)
+        self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
+        self._servos = [
+            EmulatedServo(servo_id, model, self._note, config.claimed_model_number, JointState())
+            for servo_id in config.ids
+        ]
+        self._bus = EmulatedBus(self._servos)
+        self._parser = protocol.Parser()
+        self._replies: deque[tuple[float, bytes]] = deque()
+        self._next_imu_s = self._start_s = time.monotonic()
+
+    def step(self, wait_s: float, control: int | None = None) -> bool:
+        """Wait for something to happen, and let it; whether the control channel has something to say."""
+        sources = [self.bus_terminal.master] if self.bus_terminal is not None else []
+        ready, _, _ = select.select([*sources, *([] if control is None else [control])], [], [], self._idle(wait_s))
+        now = time.monotonic()
+        self._joints.advance(now)
+        self._measure()
+        for servo in self._servos:
+            servo.watch(now)
+        if self.bus_terminal is not None and self.bus_terminal.master in ready:
+            for packet in self._parser.feed(self.bus_terminal.read()):
+                if packet.instruction == protocol.SYNC_READ:
+                    for servo in self._servos:
+                        self.events.append((now, servo.servo_id, "present_position", servo.present_position))
+                self._queue(self._bus.answer(packet, now), now)
+        self._send_due(time.monotonic())
+        self._send_attitude(now)
+        return control in ready
+
+    def set_faults(self, changes: dict[str, Any]) -> None:
+        """Switch faults on and off."""
+        self.faults = changed(self.faults, changes)
+        for servo in self._servos:
+            servo.overload(self.faults.overload)
+        if self.faults.unplugged and self.bus_terminal is not None:
+            self.bus_terminal.close()
+            self.bus_terminal = None
+        elif not self.faults.unplugged and self.bus_terminal is None:
+            self.bus_terminal = Terminal.opened()
+            self._parser = protocol.Parser()
+            self._replies.clear()
+
+    @property
+    def ports(self) -> dict[str, str | None]:
+        """Names of the servos' port and of the IMU's."""
+        bus = None if self.bus_terminal is None else self.bus_terminal.name
+        return {"port": bus, "imu_port": self.imu_terminal.name}
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Truth about joints and servos."""
+        return {
+            "time_s": time.monotonic(),
+            "theta": self._joints.theta.tolist(),
+            "q": self._joints.q.tolist(),
+            "torque_on": [servo.is_on for servo in self._servos],
+            "skipped_s": self._joints.skipped_s,
+        }
+
+    def _idle(self, wait_s: float) -> float:
+        due = [self._replies[0][0]] if self._replies else []
+        return max(min([time.monotonic() + min(wait_s, _PHYSICS_S), self._next_imu_s, *due]) - time.monotonic(), 0.0)
+
+    def _note(self, servo_id: int, name: str, value: int) -> None:
+        self.events.append((time.monotonic(), servo_id, name, value))
+        index = next(i for i, servo in enumerate(self._servos) if servo.servo_id == servo_id)
+        servo = self._servos[index]
+        if name == "torque_enable":
+            self._joints.set_torque(index, bool(value))
+            self._joints.command(index, servo.goal)
+        if name == "goal_position" and servo.is_on:
+            self._joints.command(index, servo.goal)
+
+    def _measure(self) -> None:
+        values = zip(self._servos, self._joints.theta, self._joints.theta_dot, self._joints.motor_torque, strict=True)
+        for servo, theta, theta_dot, torque in values:
+            servo.joint.position, servo.joint.velocity = float(theta), float(theta_dot)
+            servo.joint.torque = float(torque) if servo.is_on else 0.0
+            servo.measure()
+
+    def _queue(self, replies: list[bytes], now: float) -> None:
+        for reply in replies:
+            sent, delay = damage(self.faults, reply, self._generator)
+            wire_s = self.config.return_delay_s + 10.0 * len(reply) / self.config.baudrate
+            begin = max(now + delay, self._replies[-1][0] if self._replies else now)
+            if sent:
+                self._replies.append((begin + wire_s, sent))
+
+    def _send_due(self, now: float) -> None:
+        due = b""
+        while self._replies and self._replies[0][0] <= now:
+            due += self._replies.popleft()[1]
+        if due and self.bus_terminal is not None:
+            self.bus_terminal.write(due)
+
+    def _send_attitude(self, now: float) -> None:
+        if now < self._next_imu_s:
+            return
+        period = 1.0 / self.config.imu_rate_hz
+        self._next_imu_s = max(self._next_imu_s + period, now)
+        if self.faults.imu_silent:
+            return
+        noise = self._generator.standard_normal(1)
+        roll = attitude(self.config.testbed.scenario.imu, self._joints.q[:1], np.zeros(1), noise)
+        sent = attitude_packet(float(roll[0]), 0.0, 0.0, now - self._start_s)
+        if self._generator.random() < self.faults.imu_corrupted:
+            sent = flip_bit(sent, self._generator)
+        self.imu_terminal.write(sent)
+
+
+def serve(config: EmulatorConfig) -> None:
+    """Emulate until the input ends; requests come as JSON lines, one each, and so do the answers."""
+    prefer_realtime()
+    emulator = Emulator(config)
+    answer: Any = emulator.ports
+    pending = b""
+    while True:
+        print(json.dumps(answer), flush=True)
+        while b"\n" not in pending:
+            if emulator.step(0.1, sys.stdin.fileno()):
+                data = os.read(sys.stdin.fileno(), 65536)
+                if not data:
+                    return
+                pending += data
+        line, _, pending = pending.partition(b"\n")
+        answer = _answer(emulator, json.loads(line))
+
+
+def _answer(emulator: Emulator, request: dict[str, Any]) -> Any:
+    if "faults" in request:
+        emulator.set_faults(request["faults"])
+        return emulator.ports
+    if "events" in request:
+        events = list(emulator.events)
+        emulator.events.clear()
+        return events
+    return emulator.state
+
+
+if __name__ == "__main__":
+    serve(EmulatorConfig.model_validate_json(sys.argv[1]))

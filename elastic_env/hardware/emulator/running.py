@@ -1,0 +1,78 @@
+"""An emulator in a process of its own, as programs and tests use it."""
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.errors import HardwareError
+
+
+class RunningEmulator:
+    """Starts an emulator; a context manager that ends it.
+
+    Args:
+        config: What to emulate.
+
+    Attributes:
+        port: Of the servos.
+        imu_port: Of the IMU.
+    """
+
+    def __init__(self, config: EmulatorConfig | None = None) -> None:
+        given = (config or EmulatorConfig()).model_dump_json()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "elastic_env.hardware.emulator.process", given],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+        self._take_ports(self._hear())
+
+    def faults(self, **changes: Any) -> None:
+        """Switch faults on and off, see `Faults`; a bus that is plugged in again has another port."""
+        self._take_ports(self._ask({"faults": changes}))
+
+    def events(self) -> list[tuple[float, int, str, int]]:
+        """What has been switched, commanded and asked for since the last call.
+
+        Monotonic time, id, register, value [count]; `present_position` is what a state that was asked for is to tell.
+        """
+        return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._ask({"events": True})]
+
+    def state(self) -> dict[str, Any]:
+        """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
+        return self._ask({"state": True})
+
+    def wait(self) -> None:
+        """Wait until it ends by itself, or an interrupt comes."""
+        self._process.wait()
+
+    def close(self) -> None:
+        """End it."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._process.wait(timeout=10)
+
+    def __enter__(self) -> "RunningEmulator":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _ask(self, request: dict[str, Any]) -> Any:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        return self._hear()
+
+    def _hear(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise HardwareError(f"the emulator ended with exit code {self._process.wait()}")
+        return json.loads(line)
+
+    def _take_ports(self, ports: dict[str, str]) -> None:
+        self.port, self.imu_port = ports["port"], ports["imu_port"]

@@ -1,0 +1,167 @@
+"""dynamixel-sdk's port and packet handler, with what version 4.1 does not do mended.
+
+| trap of dynamixel-sdk 4.1 | here |
+|---|---|
+| outgoing packets are not byte-stuffed | `PacketHandler.txPacket` sends what `protocol.stuff` makes |
+| unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` is `protocol.unstuff` |
+| every reply may take 34 ms before it counts as missing | `Port.reply_timeout_s` |
+| waiting for a reply is a busy loop | `Port` blocks in the read |
+| an interrupted read leaves the port "in use", and torque off is refused | `Port.release` |
+| an unplugged port raises SerialException, or OSError, or termios.error | `bus_gone` makes one error of them |
+| two programs can open one port and speak at the same time | `Port` locks it |
+"""
+
+import errno
+import fcntl
+import os
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from elastic_env.errors import missing_extra
+from elastic_env.hardware import protocol
+from elastic_env.hardware.errors import BusGoneError, PortError
+
+try:
+    import serial
+    from dynamixel_sdk import COMM_PORT_BUSY, COMM_SUCCESS, COMM_TX_ERROR, COMM_TX_FAIL, PortHandler
+    from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
+except ModuleNotFoundError as error:
+    raise missing_extra(str(error.name), "hardware", "the testbed on real hardware") from None
+
+DEFAULT_BAUDRATE = 3_000_000
+"""Bits per second: the fastest that servos, adapter and SDK share without an odd rate."""
+
+_READ_SLICE_S = 1e-3
+_LONGEST_PACKET = 1024
+
+
+@contextmanager
+def bus_gone(port: str) -> Iterator[None]:
+    """Turn what a vanished port raises into one error.
+
+    Raises:
+        BusGoneError: The port failed within.
+    """
+    try:
+        yield
+    except (serial.SerialException, OSError, termios.error) as error:
+        raise BusGoneError(
+            f"the bus at {port} is gone ({_words(error)}): unplugged, or its adapter failed. Servos without a bus "
+            "watchdog hold their last goal: switch their power off"
+        ) from None
+
+
+class Port(PortHandler):
+    """A serial port for one program alone.
+
+    Args:
+        name: Device, such as /dev/ttyUSB0.
+        baudrate: Bits per second.
+    """
+
+    def __init__(self, name: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
+        super().__init__(name)
+        self.baudrate = baudrate
+        self.reply_timeout_s = 0.05
+
+    def open(self) -> None:
+        """Open and lock the port.
+
+        Raises:
+            PortError: It does not exist, may not be opened, or another program has it.
+        """
+        name = self.port_name
+        if self.getCFlagBaud(self.baudrate) < 0:
+            raise PortError(f"the SDK has no rate of {self.baudrate} bit/s for {name}; try 57600, 1000000 or 3000000")
+        try:
+            self.setupPort(self.baudrate)
+        except serial.SerialException as error:
+            raise _cannot_open(name, error) from None
+        try:
+            fcntl.flock(self.ser.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.closePort()
+            raise PortError(
+                f"another program uses {name}; two on one bus would garble each other's packets. End that program "
+                f"(fuser {name} says which it is), or name another port"
+            ) from None
+
+    def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: ARG002, N802  the SDK's name
+        """Open the device such that a read blocks for a short while instead of not at all."""
+        self.ser = serial.Serial(self.port_name, self.baudrate, timeout=_READ_SLICE_S, write_timeout=0.1)
+        self.is_open = True
+        self.tx_time_per_byte = 1e4 / self.baudrate
+        return True
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        """Time for a reply: the bytes on the wire, and `reply_timeout_s`."""
+        self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + 1e3 * self.reply_timeout_s)
+
+    def getCurrentTime(self) -> float:  # noqa: N802
+        """Milliseconds of a clock that nobody sets."""
+        return 1e3 * time.monotonic()
+
+    def release(self) -> None:
+        """Make the port usable again after an interrupted read."""
+        self.is_using = False
+
+    def closePort(self) -> None:  # noqa: N802
+        """Close; a second time, or without having been open, does nothing."""
+        if self.ser is not None:
+            with bus_gone(self.port_name):
+                self.ser.close()
+        self.is_open = False
+
+    @property
+    def latency_timer_ms(self) -> int | None:
+        """How long a USB adapter collects bytes before it passes them on [ms]; None where nobody says."""
+        device = Path("/sys/bus/usb-serial/devices") / Path(os.path.realpath(self.port_name)).name / "latency_timer"
+        try:
+            return int(device.read_text())
+        except (OSError, ValueError):
+            return None
+
+
+class PacketHandler(Protocol2PacketHandler):
+    """The SDK's packet handler with byte stuffing in both directions."""
+
+    def txPacket(self, port: Any, txpacket: list[int]) -> Any:  # noqa: N802  the SDK's name
+        """Send an instruction that the SDK has laid out: id, instruction and parameters at their places."""
+        if port.is_using:
+            return COMM_PORT_BUSY
+        length = txpacket[5] | txpacket[6] << 8
+        sent = protocol.packet(txpacket[4], txpacket[7], bytes(txpacket[8 : 5 + length]))
+        if len(sent) > _LONGEST_PACKET:
+            return COMM_TX_ERROR
+        port.is_using = True
+        port.clearPort()
+        if port.writePort(sent) != len(sent):
+            port.is_using = False
+            return COMM_TX_FAIL
+        return COMM_SUCCESS
+
+    def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
+        """A received packet without its stuffing; its length field fits again."""
+        body = protocol.unstuff(bytes(packet[7:-2]))
+        length = len(body) + 2
+        return [*packet[:5], length & 0xFF, length >> 8, *body, *packet[-2:]]
+
+
+def _words(error: Exception) -> str:
+    """What an error says; termios gives a number and a text."""
+    return str(error.args[1]) if len(error.args) > 1 else str(error)
+
+
+def _cannot_open(name: str, error: Any) -> PortError:
+    if error.errno == errno.EACCES:
+        cure = "you may not open it: sudo usermod -aG dialout $USER, then log in again"
+    elif error.errno in (errno.ENOENT, errno.ENXIO) or not Path(name).exists():
+        found = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in Path("/dev").glob(pattern))
+        cure = f"there is no such device; found: {', '.join(found) or 'no USB serial adapter'}"
+    else:
+        cure = str(error)
+    return PortError(f"cannot open the port {name}: {cure}")

@@ -1,0 +1,116 @@
+"""Limits on what is commanded and on what is measured, for the last layer before the wire."""
+
+from typing import Self
+
+import numpy as np
+from pydantic import model_validator
+
+from elastic_env.config import Model, quantity
+from elastic_env.hardware.bus import States
+from elastic_env.hardware.errors import FaultError
+from elastic_env.hardware.torque_line import torque_of_current
+from elastic_env.signals import Array, BoolArray, IntArray
+
+
+class SafetyLimits(Model):
+    """What no command may exceed, and what stops the motion when it is measured; angles as the servo has them."""
+
+    lowest_rad: float = quantity("rad", -1.6, description="lowest goal")
+    highest_rad: float = quantity("rad", 1.6, description="highest goal")
+    slew_rad_s: float = quantity("rad/s", 3.0, gt=0, description="fastest change of the goal")
+    speed_rad_s: float = quantity("rad/s", 4.5, gt=0, description="measured speed that stops the motion")
+    torque_nm: float = quantity("N·m", 84.0, gt=0, description="torque, by the current, that stops the motion")
+    following_error_rad: float = quantity("rad", 0.35, gt=0, description="distance from the goal that stops it")
+    margin_rad: float = quantity("rad", 0.05, ge=0, description="how far beyond the goals' range a position may lie")
+    patience_cycles: int = quantity("1", 3, ge=1, le=10, description="cycles without a reply, or too much torque")
+    hang_s: float = quantity("s", 0.05, gt=0, le=0.09, description="time without a command that stops the motion")
+
+    @model_validator(mode="after")
+    def _range_is_ordered(self) -> Self:
+        if self.lowest_rad >= self.highest_rad:
+            raise ValueError(f"lowest_rad must be below highest_rad, got {self.lowest_rad} and {self.highest_rad}")
+        return self
+
+
+class Guard:
+    """Keeps commands within limits, and notices when the measured state leaves them.
+
+    Args:
+        limits: The limits, the same for all servos.
+        measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead away from there as
+            fast as the limits allow.
+
+    Raises:
+        FaultError: A position lies outside the goals' range, or is not known.
+    """
+
+    def __init__(self, limits: SafetyLimits, measured: Array) -> None:
+        self.limits = limits
+        self.goals = np.array(measured, dtype=np.float64)
+        self._missed: IntArray = np.zeros(len(measured), dtype=np.int64)
+        self._strained: IntArray = np.zeros(len(measured), dtype=np.int64)
+        outside = self._outside(self.goals)
+        if outside.any() or not np.isfinite(self.goals).all():
+            raise FaultError(
+                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad, the servos stand "
+                f"at {np.round(self.goals, 3).tolist()} rad; move them by hand while torque is off, or widen the limits"
+            )
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether a reply was missing in the last cycle: the last command is then repeated, whatever is asked for."""
+        return bool(self._missed.any())
+
+    def command(self, goals: Array, elapsed_s: float) -> tuple[Array, BoolArray]:
+        """What may be commanded now.
+
+        Args:
+            goals: What is asked for, (n,) [rad].
+            elapsed_s: Time since the last command [s].
+
+        Returns:
+            Goals within position and slew limits, and where they differ from what was asked for.
+
+        Raises:
+            FaultError: A goal is not a finite number.
+        """
+        asked = np.asarray(goals, dtype=np.float64)
+        if asked.shape != self.goals.shape or not np.isfinite(asked).all():
+            raise FaultError(f"goals must be {len(self.goals)} finite angles [rad], got {np.asarray(goals).tolist()}")
+        if self.is_holding:
+            return self.goals.copy(), asked != self.goals
+        limits = self.limits
+        reach = limits.slew_rad_s * elapsed_s
+        allowed = np.clip(np.clip(asked, limits.lowest_rad, limits.highest_rad), self.goals - reach, self.goals + reach)
+        self.goals = allowed
+        return allowed.copy(), allowed != asked
+
+    def take(self, states: States) -> str:
+        """Take a cycle's replies; why the motion must stop, "" if it need not."""
+        limits = self.limits
+        self._missed = np.where(states.is_fresh, 0, self._missed + 1)
+        torque = np.abs(torque_of_current(states.current))
+        self._strained = np.where(states.is_fresh & (torque > limits.torque_nm), self._strained + 1, 0)
+        if states.has_alert.any():
+            return "a servo reports a hardware error"
+        if (self._missed >= limits.patience_cycles).any():
+            return f"no usable reply in {limits.patience_cycles} cycles in a row"
+        if (states.is_fresh & self._outside(states.position)).any():
+            return (
+                f"a position is outside {limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad: "
+                f"{np.round(states.position, 3).tolist()}"
+            )
+        if (states.is_fresh & (np.abs(states.velocity) > limits.speed_rad_s)).any():
+            return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {np.round(states.velocity, 2).tolist()}"
+        if (states.is_fresh & (np.abs(states.position - self.goals) > limits.following_error_rad)).any():
+            return (
+                f"a servo is further than {limits.following_error_rad:g} rad from its goal: positions "
+                f"{np.round(states.position, 3).tolist()}, goals {np.round(self.goals, 3).tolist()} rad"
+            )
+        if (self._strained >= limits.patience_cycles).any():
+            return f"the torque exceeds {limits.torque_nm:g} N·m: {np.round(torque, 1).tolist()}"
+        return ""
+
+    def _outside(self, positions: Array) -> BoolArray:
+        low, high = self.limits.lowest_rad - self.limits.margin_rad, self.limits.highest_rad + self.limits.margin_rad
+        return (positions < low) | (positions > high)

@@ -1,0 +1,215 @@
+"""A program's side of the supervisor: servos that lose their torque when the program does not behave."""
+
+import contextlib
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from elastic_env.hardware.bus import Bus, States
+from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
+from elastic_env.hardware.port import DEFAULT_BAUDRATE
+from elastic_env.hardware.safety import SafetyLimits
+from elastic_env.signals import Array, BoolArray
+
+_ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
+_KEEP_ALIVE_S = 0.008
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What came of one control cycle."""
+
+    states: States
+    goals: Array
+    """What was commanded, (n,) [rad]."""
+    is_limited: BoolArray
+    """Where that is not what was asked for, (n,)."""
+    is_held: bool
+    """Whether the last command was repeated because a reply was missing."""
+    late_s: float
+    """How much later than asked for the servos were read [s]."""
+
+
+class SupervisedBus:
+    """Servos on one port or several, moved through a supervisor process of their own.
+
+    Args:
+        ports: Ids of the servos by port; arrays of all servos have them in this order.
+        baudrate: Bits per second.
+
+    Raises:
+        PortError: A port cannot be had.
+        ReplyError: A servo does not answer.
+        HardwareError: Its model is not known, or something is set such that nothing may move.
+    """
+
+    def __init__(self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> None:
+        self._ports, self._baudrate = {port: list(ids) for port, ids in ports.items()}, baudrate
+        own, other = Channel.pair()
+        with other:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports],
+                pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
+            )  # fmt: skip
+        self._channel = Channel(own)
+        self._number = 0
+        self._lock = threading.Lock()
+        self._keeper: threading.Thread | None = None
+        self._is_kept = threading.Event()
+        try:
+            self.is_realtime = bool(self._hear(0)["is_realtime"])
+            self.models: list[list[int]] = self._ask("attach", ids=list(self._ports.values()))["models"]
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def process_id(self) -> int:
+        """Of the supervisor."""
+        return self._process.pid
+
+    def enable(self, limits: SafetyLimits | None = None) -> Array:
+        """Torque on where the servos stand.
+
+        Returns:
+            Their positions, (n,) [rad].
+
+        Raises:
+            FaultError: A servo reports a hardware error, or stands outside the limits.
+        """
+        self._limits = limits or SafetyLimits()
+        answer = self._ask("enable", limits=self._limits.model_dump())
+        return np.array(answer["position"])
+
+    def exchange(self, goals: Array, at: float) -> Cycle:
+        """One control cycle: command, wait for a moment of the monotonic clock, read.
+
+        Args:
+            goals: Positions asked for, (n,) [rad].
+            at: When to read [s]; at most 20 ms ahead.
+
+        Raises:
+            FaultError: The motion was stopped, now or since the last cycle; the message says why.
+            BusGoneError: The port is gone.
+        """
+        self.stop_keeping()
+        try:
+            answer = self._ask("exchange", goals=np.asarray(goals, dtype=np.float64).tolist(), at=at)
+        except BaseException:
+            self._let_go()
+            raise
+        return Cycle(
+            _states(answer), np.array(answer["goals"]), np.array(answer["limited"]), bool(answer["held"]),
+            float(answer["late_s"]),
+        )  # fmt: skip
+
+    def read(self) -> States:
+        """States without a command."""
+        return _states(self._ask("read"))
+
+    def keep(self, goals: Array, limit_s: float = 5.0) -> None:
+        """Hold goals from a thread until the next cycle, for at most a time: between moving and stepping.
+
+        A program that hangs as a whole takes the thread with it, and torque goes off as ever.
+        """
+        self.stop_keeping()
+        self._is_kept.set()
+        self._keeper = threading.Thread(target=self._keep, args=(goals, time.monotonic() + limit_s), daemon=True)
+        self._keeper.start()
+
+    def stop_keeping(self) -> None:
+        """End what `keep` began."""
+        if self._keeper is not None:
+            self._is_kept.clear()
+            self._keeper.join()
+            self._keeper = None
+
+    def _keep(self, goals: Array, end_s: float) -> None:
+        with contextlib.suppress(HardwareError):
+            while self._is_kept.is_set() and time.monotonic() < end_s:
+                self._ask("exchange", goals=goals.tolist(), at=time.monotonic() + _KEEP_ALIVE_S)
+
+    def disable(self) -> None:
+        """Torque off.
+
+        Raises:
+            ReplyError: A servo does not confirm it.
+            BusGoneError: The port is gone.
+        """
+        self.stop_keeping()
+        self._ask("disable")
+
+    def close(self) -> None:
+        """Torque off, and give the ports back."""
+        self.stop_keeping()
+        self._channel.close()
+        try:
+            self._process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            self._process.terminate()
+            self._process.wait(timeout=5.0)
+
+    def __enter__(self) -> "SupervisedBus":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _let_go(self) -> None:
+        """Torque off after an interrupted cycle, whatever its answer would have been."""
+        with contextlib.suppress(HardwareError, OSError):
+            self._ask("disable")
+
+    def _ask(self, action: str, **arguments: Any) -> dict[str, Any]:
+        with self._lock:
+            self._number += 1
+            try:
+                self._channel.send({"number": self._number, "do": action, "with": arguments})
+            except OSError:
+                raise self._without_supervisor() from None
+            return self._hear(self._number)
+
+    def _hear(self, number: int) -> dict[str, Any]:
+        """The answer of a number; those of requests that were interrupted are passed over."""
+        while (answer := self._channel.receive()) is not None:
+            if answer["number"] == number:
+                if "error" in answer:
+                    raise _ERRORS[answer["error"]](answer["message"])
+                return answer
+        raise self._without_supervisor()
+
+    def _without_supervisor(self) -> FaultError:
+        """The supervisor died: switch torque off in its place."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
+        code = self._process.poll()
+        said = emergency_stop(self._ports, self._baudrate)
+        return FaultError(f"the supervisor process ended (exit code {code}); {said}")
+
+
+def emergency_stop(ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> str:
+    """Switch torque off without a supervisor; what came of it, in words."""
+    said = []
+    for port, ids in ports.items():
+        try:
+            with Bus(port, baudrate) as bus:
+                bus.attach(ids)
+                bus.torque_off()
+                unconfirmed = bus.confirm_torque_off()
+        except HardwareError as error:
+            said.append(f"torque could not be switched off: {error}")
+        else:
+            said.append(f"torque off not confirmed by {', '.join(unconfirmed)}" if unconfirmed else "torque is off")
+    return "; ".join(dict.fromkeys(said))
+
+
+def _states(answer: dict[str, Any]) -> States:
+    names = ("position", "velocity", "current", "is_fresh", "has_alert")
+    return States(*(np.array(answer[name]) for name in names), time_s=float(answer["time_s"]))

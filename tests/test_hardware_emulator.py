@@ -1,0 +1,180 @@
+"""The emulated servo: registers, rights, errors, watchdog, and the order of replies, without any terminal."""
+
+import numpy as np
+import pytest
+
+from elastic_env.errors import ConfigurationError
+from elastic_env.hardware import protocol
+from elastic_env.hardware.control_table import servo_model
+from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.faults import Faults, damage
+from elastic_env.hardware.emulator.joints import Joints
+from elastic_env.hardware.emulator.servo import EmulatedServo
+from elastic_env.hardware.emulator.wire import EmulatedBus
+from elastic_env.hardware.protocol import Packet, Parser
+from elastic_env.plan import quintic
+from elastic_env.scenario import make_scenario
+from elastic_env.tasks.testbed_config import TestbedConfig
+
+
+def make_servo(number: int = 54024, servo_id: int = 1) -> EmulatedServo:
+    return EmulatedServo(servo_id, servo_model(number), lambda *_: None)
+
+
+def write(servo: EmulatedServo, name: str, value: int) -> int:
+    register = servo.model.table[name]
+    return servo.write(register.address, register.encode(value))
+
+
+def read(servo: EmulatedServo, name: str) -> int:
+    register = servo.model.table[name]
+    error, data = servo.read(register.address, register.size)
+    assert error & ~protocol.ALERT == 0
+    return register.decode(data)
+
+
+def test_registers_keep_their_rights() -> None:
+    """Catches a servo that lets itself be written where the real one refuses."""
+    servo = make_servo()
+    assert write(servo, "present_position", 5) == protocol.ACCESS_ERROR
+    assert write(servo, "goal_position", 300_000) == protocol.LIMIT_ERROR
+    assert write(servo, "torque_enable", 2) == protocol.RANGE_ERROR
+    assert servo.write(596, b"\x01\x02") == protocol.LENGTH_ERROR
+    assert servo.write(597, b"\x01\x02\x03\x04") == protocol.ACCESS_ERROR
+    assert write(servo, "goal_position", -131_073) == 0
+    assert read(servo, "goal_position") == -131_073
+
+
+def test_eeprom_is_locked_while_torque_is_on() -> None:
+    """Catches an emulator on which a driver could change limits in motion."""
+    servo = make_servo()
+    assert write(servo, "max_position_limit", 100_000) == 0
+    assert write(servo, "torque_enable", 1) == 0
+    assert write(servo, "max_position_limit", 200_000) == protocol.ACCESS_ERROR
+    assert read(servo, "max_position_limit") == 100_000
+
+
+def test_a_servo_that_gets_torque_holds_where_it_is() -> None:
+    """Catches a jump to an old goal when torque is switched on."""
+    servo = make_servo()
+    servo.joint.position = 0.25
+    write(servo, "goal_position", 1000)
+    write(servo, "torque_enable", 1)
+    assert servo.goal == pytest.approx(0.25, abs=servo.model.position_unit)
+
+
+def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
+    """Catches an alert that comes as an error: it arrives with success, which a driver must not overlook."""
+    servo = make_servo()
+    write(servo, "torque_enable", 1)
+    servo.overload(True)
+    assert not servo.is_on
+    error, data = servo.read(611, 4)
+    assert error == protocol.ALERT
+    assert len(data) == 4
+    assert write(servo, "torque_enable", 1) == protocol.ALERT | protocol.RESULT_FAIL
+
+
+def test_watchdog_stops_models_that_have_one() -> None:
+    """Catches a watchdog that fires while the bus speaks, or never, or on the firmware that has none.
+
+    A fired one holds the servo where it is, under torque, and refuses goals until it is cleared.
+    """
+    servo = make_servo(2020)
+    servo.hear(10.0)
+    write(servo, "torque_enable", 1)
+    write(servo, "bus_watchdog", 3)
+    write(servo, "goal_position", 5000)
+    servo.watch(10.05)
+    assert read(servo, "goal_position") == 5000
+    servo.watch(10.07)
+    assert servo.is_on
+    assert (read(servo, "goal_position"), read(servo, "bus_watchdog")) == (0, -1)
+    assert write(servo, "goal_position", 5000) == protocol.RANGE_ERROR
+    write(servo, "bus_watchdog", 0)
+    assert write(servo, "goal_position", 5000) == 0
+    old = make_servo(54024)
+    old.hear(0.0)
+    write(old, "goal_position", 5000)
+    old.watch(100.0)
+    assert read(old, "goal_position") == 5000
+
+
+def answers(bus: EmulatedBus, wire: bytes) -> list[Packet]:
+    (instruction,) = Parser().feed(wire)
+    return [reply for sent in bus.answer(instruction, 0.0) for reply in Parser().feed(sent)]
+
+
+def test_sync_and_bulk_instructions_reach_their_servos_in_order() -> None:
+    """Catches a group that is cut at the wrong byte, and replies in the order of ids instead of the request's."""
+    bus = EmulatedBus([make_servo(servo_id=i) for i in (1, 2, 3)])
+    values = {1: -131_073, 3: 77}
+    data = b"".join(bytes([i]) + v.to_bytes(4, "little", signed=True) for i, v in values.items())
+    assert answers(bus, protocol.packet(0xFE, protocol.SYNC_WRITE, bytes([0x54, 2, 4, 0]) + data)) == []
+    replies = answers(bus, protocol.packet(0xFE, protocol.SYNC_READ, bytes([0x54, 2, 4, 0, 3, 1, 2])))
+    assert [r.servo_id for r in replies] == [3, 1, 2]
+    assert [int.from_bytes(r.parameters[1:], "little", signed=True) for r in replies] == [77, -131_073, 0]
+    bulk = bytes([2, 0x54, 2, 4, 0, 9, 0, 0, 0, 1, 0x32, 2, 1, 0, 1])
+    answers(bus, protocol.packet(0xFE, protocol.BULK_WRITE, bulk))
+    replies = answers(bus, protocol.packet(0xFE, protocol.BULK_READ, bytes([2, 0x54, 2, 4, 0, 1, 0x32, 2, 1, 0])))
+    assert [r.parameters[1:] for r in replies] == [b"\x09\x00\x00\x00", b"\x01"]
+
+
+def test_fast_reply_is_one_packet_with_a_part_of_every_servo() -> None:
+    """Catches parts without their checksums: each ends with one of everything before it."""
+    bus = EmulatedBus([make_servo(servo_id=i) for i in (1, 2)])
+    (wire,) = bus.answer(
+        Parser().feed(protocol.packet(0xFE, protocol.FAST_SYNC_READ, bytes([0x71, 2, 1, 0, 1, 2])))[0], 0.0
+    )
+    assert wire[:8] == bytes.fromhex("FFFFFD00FE0B0055")
+    assert wire[8:11] == bytes([0, 1, 35])
+    assert wire[13:16] == bytes([0, 2, 35])
+    assert protocol.crc16(wire[:11]) == int.from_bytes(wire[11:13], "little")
+    assert protocol.crc16(wire[:16]) == int.from_bytes(wire[16:], "little")
+
+
+def test_damaged_instruction_is_answered_with_an_error_and_not_obeyed() -> None:
+    """Catches a servo that moves on a packet whose checksum is wrong."""
+    servo = make_servo()
+    wire = bytearray(protocol.packet(1, protocol.WRITE, bytes([0x32, 2, 1])))
+    wire[10] ^= 0x02
+    (reply,) = answers(EmulatedBus([servo]), bytes(wire))
+    assert reply.parameters[0] == protocol.CRC_ERROR
+    assert not servo.is_on
+
+
+def test_faults_come_as_often_as_they_are_asked_for() -> None:
+    """Catches a switch that does nothing, or that damages what it should leave alone."""
+    generator, reply = np.random.default_rng(0), protocol.status(1, 0, b"\x01\x02\x03\x04")
+    half = [damage(Faults(lost=0.5), reply, generator)[0] for _ in range(400)]
+    assert 150 < half.count(b"") < 250
+    assert all(damage(Faults(), reply, generator) == (reply, 0.0) for _ in range(20))
+    changed = [damage(Faults(corrupted=1.0), reply, generator)[0] for _ in range(20)]
+    assert all(sum(bin(a ^ b).count("1") for a, b in zip(c, reply, strict=True)) == 1 for c in changed)
+    assert all(len(damage(Faults(truncated=1.0), reply, generator)[0]) < len(reply) for _ in range(20))
+    assert damage(Faults(late=1.0, late_s=0.01, latency_s=0.016), reply, generator)[1] == pytest.approx(0.026)
+
+
+def test_emulated_joint_is_the_testbeds_own() -> None:
+    """Catches a second model of the plant: at rest the spring carries what gravity asks for."""
+    config = TestbedConfig(scenario=make_scenario("ideal"))
+    joints = Joints(config, 2, start_s=0.0)
+    joints.set_torque(0, is_on=True)
+    for step, share in enumerate(quintic(np.arange(1200) / 500)[0]):
+        joints.command(0, 0.5 * float(share))
+        joints.advance(0.004 * step)
+    deflection = joints.theta - joints.q
+    torque = config.true_pendulum.torque(joints.q)
+    assert config.true_joint.stiffness * deflection[0] == pytest.approx(torque[0], rel=2e-3)
+    assert torque[0] > 25.0
+    assert joints.q[1] == 0.0
+    joints.set_torque(0, is_on=False)
+    joints.advance(4.9)
+    assert joints.motor_torque[0] == 0.0
+
+
+def test_emulator_that_cannot_be_is_refused() -> None:
+    """Catches two servos of one id, and an id that the protocol keeps for itself."""
+    for ids in ((1, 1), (0xFD,), ()):
+        with pytest.raises(ConfigurationError, match="ids"):
+            EmulatorConfig(ids=ids)

@@ -1,0 +1,131 @@
+"""Packets and control tables: against the maker's examples, the SDK's own functions, and random bytes."""
+
+import itertools
+
+import numpy as np
+import pytest
+from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
+from hypothesis import given
+from hypothesis import strategies as st
+
+from elastic_env.errors import ConfigurationError
+from elastic_env.hardware import protocol
+from elastic_env.hardware.control_table import explain_errors, servo_model, servo_models
+from elastic_env.hardware.emulator.mip import attitude_packet, checksum
+from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.torque_line import current_of_torque, torque_of_current
+
+# of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
+EXAMPLES = [
+    ((1, protocol.PING, b""), "FF FF FD 00 01 03 00 01 19 4E"),
+    ((1, protocol.STATUS, bytes([0, 6, 4, 0x26])), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
+    ((1, protocol.READ, bytes([0x84, 0, 4, 0])), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
+    ((1, protocol.WRITE, bytes([0x74, 0, 0, 2, 0, 0])), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
+    ((254, protocol.SYNC_READ, bytes([0x84, 0, 4, 0, 1, 2])), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
+    ((1, protocol.REBOOT, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
+]
+
+
+@pytest.mark.parametrize(("content", "wire"), EXAMPLES)
+def test_packets_are_those_of_the_makers_examples(content: tuple[int, int, bytes], wire: str) -> None:
+    """Catches a wrong checksum, byte order or length in what both our ends would agree on."""
+    assert protocol.packet(*content) == bytes.fromhex(wire)
+    found = protocol.Parser().feed(bytes.fromhex(wire))
+    assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [(*content, True)]
+
+
+@given(st.binary(max_size=60))
+def test_checksum_is_the_sdks(data: bytes) -> None:
+    """Catches a table of ours that differs from the SDK's in a single entry."""
+    assert protocol.crc16(data) == Protocol2PacketHandler().updateCRC(0, list(data), len(data))
+
+
+@given(st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55]), max_size=30).map(bytes))
+def test_stuffed_bytes_hold_no_header_and_come_back(data: bytes) -> None:
+    """Catches a header that survives stuffing, and stuffing that takes a byte of the data away."""
+    assert protocol.stuff(data).replace(b"\xff\xff\xfd\xfd", b"").find(b"\xff\xff\xfd") < 0
+    assert protocol.unstuff(protocol.stuff(data)) == data
+
+
+@given(
+    st.lists(st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x07]), max_size=12).map(bytes), min_size=1, max_size=4),
+    st.lists(st.integers(1, 9), min_size=1, max_size=8),
+)
+def test_parser_finds_packets_in_pieces_behind_noise(bodies: list[bytes], pieces: list[int]) -> None:
+    """Catches a parser that needs whole packets at a time, or that loses step by what lies before the first."""
+    stream = b"\xff\xff\x00\xfd" + b"".join(protocol.status(7, 0, body) for body in bodies)
+    parser, found, at = protocol.Parser(), [], 0
+    for number in range(len(stream)):
+        step = pieces[number % len(pieces)]
+        found += parser.feed(stream[at : at + step])
+        at += step
+    assert [packet.parameters[1:] for packet in found] == bodies
+
+
+def test_parser_gives_a_damaged_packet_as_damaged_and_goes_on() -> None:
+    """Catches a flipped bit that is taken for data, and a lost tail that swallows the next packet."""
+    good = protocol.status(1, 0, b"\x01\x02\x03\x04")
+    flipped = bytearray(good)
+    flipped[10] ^= 1
+    assert [p.is_intact for p in protocol.Parser().feed(bytes(flipped) + good)] == [False, True]
+    assert [p.parameters for p in protocol.Parser().feed(good[:9] + good)] == [b"\x00\x01\x02\x03\x04"]
+
+
+def test_tables_have_the_registers_of_the_maker() -> None:
+    """Catches a shifted row of the data: addresses that the issue's robots rely on."""
+    pro, advanced = servo_model(54024), servo_model(2020)
+    assert [pro.table[name].address for name in ("torque_enable", "goal_position", "present_position")] == [
+        562,
+        596,
+        611,
+    ]
+    names = ("torque_enable", "goal_position", "present_current", "present_velocity", "present_position")
+    assert [advanced.table[name].address for name in names] == [512, 564, 574, 576, 580]
+    assert not pro.has_watchdog
+    assert advanced.has_watchdog
+    assert servo_model(54025).table == advanced.table
+
+
+@pytest.mark.parametrize("number", [54024, 54025, 2020])
+def test_registers_do_not_overlap_and_blocks_are_of_whole_registers(number: int) -> None:
+    """Catches a wrong size in the data, and a block whose lengths would not tell requests apart."""
+    model = servo_model(number)
+    registers = list(model.table.values())
+    assert all(a.end <= b.address for a, b in itertools.pairwise(registers))
+    assert len(set(model.block_lengths)) == 4
+    for length in model.block_lengths:
+        assert model.block_address + length in {register.end for register in registers}
+
+
+def test_units_are_the_makers() -> None:
+    """Catches counts of one model used for another: half a turn, 33.1 rpm without load, 9.99 A of current limit."""
+    assert 250_961.5 * servo_model(54024).position_unit == pytest.approx(np.pi)
+    assert 501_923 * servo_model(2020).position_unit == pytest.approx(np.pi)
+    assert 620 * servo_model(54024).current_unit == pytest.approx(9.99, abs=0.005)
+    assert 2900 * servo_model(2020).velocity_unit == pytest.approx(29.0 * 2 * np.pi / 60)
+    assert 17000 * servo_model(54024).velocity_unit == pytest.approx(33.87 * 2 * np.pi / 60, rel=1e-4)
+
+
+def test_unknown_names_are_answered_with_those_that_exist() -> None:
+    """Catches a KeyError in place of a message."""
+    with pytest.raises(HardwareError, match="54024"):
+        servo_model(1020)
+    with pytest.raises(ConfigurationError, match="goal_position"):
+        servo_models()[54024].table["goal_positon"]
+    with pytest.raises(HardwareError, match="does not fit"):
+        servo_models()[54024].table["goal_torque"].encode(40_000)
+    assert explain_errors(0b100100) == "overheating, overload"
+
+
+def test_torque_line_runs_both_ways() -> None:
+    """Catches a sign or an offset that emulator and driver would not share."""
+    for torque in (-52.5, -1.0, 0.5, 34.6):
+        assert torque_of_current(current_of_torque(torque)) == pytest.approx(torque)
+    assert torque_of_current(0.3) == 0.0
+
+
+def test_ping_of_the_imus_protocol_has_the_makers_checksum() -> None:
+    """Catches a checksum that only our own reader would accept: 75 65 01 02 02 01 E0 C6 is the maker's ping."""
+    assert checksum(bytes.fromhex("756501020201")) == bytes.fromhex("E0C6")
+    packet = attitude_packet(0.1, -0.2, 0.3, 1.0)
+    assert packet[:4] == bytes([0x75, 0x65, 0x82, len(packet) - 6])

@@ -1,0 +1,290 @@
+"""Limits by themselves; bus and supervisor through the real SDK on an emulated bus, in good times and bad."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from elastic_env.errors import ConfigurationError
+from elastic_env.hardware.bus import Bus, Buses, States
+from elastic_env.hardware.checks import check_bus
+from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
+from elastic_env.hardware.safety import Guard, SafetyLimits
+from elastic_env.hardware.supervised import SupervisedBus
+
+PERIOD_S = 0.004
+PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
+"""Limits for tests of other things: a busy computer delays pseudo-terminals."""
+
+
+def states(position: list[float], velocity: float = 0.0, current: float = 0.0, fresh: bool = True) -> States:
+    n = len(position)
+    values = np.array(position) if fresh else np.full(n, np.nan)
+    return States(
+        values, np.full(n, velocity), np.full(n, current), np.full(n, fresh), np.zeros(n, dtype=np.bool_), 0.0
+    )  # fmt: skip
+
+
+def test_first_commands_lead_away_from_where_the_servo_stands_no_faster_than_allowed() -> None:
+    """Catches the jump to the first goal, and a limit that holds for one step but not for the next."""
+    guard = Guard(SafetyLimits(slew_rad_s=1.0), np.array([0.2]))
+    at = [float(guard.command(np.array([1.0]), 0.004)[0][0]) for _ in range(3)]
+    np.testing.assert_allclose(at, [0.204, 0.208, 0.212])
+
+
+def test_goals_stay_within_the_position_limits() -> None:
+    """Catches limits that only one side has, or that the slew limit undoes."""
+    guard = Guard(SafetyLimits(lowest_rad=-0.1, highest_rad=0.3, slew_rad_s=1000.0), np.zeros(2))
+    goals, is_limited = guard.command(np.array([-5.0, 5.0]), 0.004)
+    assert goals.tolist() == [-0.1, 0.3]
+    assert is_limited.all()
+
+
+@pytest.mark.parametrize("goals", [[np.nan], [np.inf], [0.0, 0.0]])
+def test_goals_that_are_no_angles_stop_the_motion(goals: list[float]) -> None:
+    """Catches a NaN that becomes some count on the wire."""
+    with pytest.raises(FaultError, match="finite"):
+        Guard(SafetyLimits(), np.zeros(1)).command(np.array(goals), 0.004)
+
+
+def test_motion_does_not_begin_outside_the_limits() -> None:
+    """Catches a first command that would drag the servo through the limit."""
+    with pytest.raises(FaultError, match="by hand"):
+        Guard(SafetyLimits(lowest_rad=-0.5), np.array([-0.6]))
+
+
+def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> None:
+    """Catches commands that go on blindly, a fault at the first hiccup, and a count that a good reply does not end."""
+    guard = Guard(SafetyLimits(slew_rad_s=1.0), np.zeros(1))
+    guard.command(np.array([1.0]), 0.004)
+    assert guard.take(states([0.0], fresh=False)) == ""
+    held, is_limited = guard.command(np.array([1.0]), 0.004)
+    assert held.tolist() == [0.004]
+    assert is_limited.all()
+    assert guard.take(states([0.0], fresh=False)) == ""
+    assert guard.take(states([0.0])) == ""
+    assert guard.command(np.array([1.0]), 0.004)[0].tolist() == [0.008]
+    assert [guard.take(states([0.0], fresh=False)) != "" for _ in range(3)] == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("measured", "words"),
+    [
+        (states([1.7]), "position"),
+        (states([0.0], velocity=-5.0), "speed"),
+        (states([0.5]), "goal"),
+    ],
+)
+def test_what_is_measured_stops_the_motion(measured: States, words: str) -> None:
+    """Catches a limit that is never looked at."""
+    assert words in Guard(SafetyLimits(), np.zeros(1)).take(measured)
+
+
+def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
+    """Catches a stop at one spike of the current, and none under a load that stays."""
+    guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1))
+    strained = states([0.0], current=-12.0)
+    assert [guard.take(s) != "" for s in (strained, strained, states([0.0]), strained, strained, strained)] == [
+        False, False, False, False, False, True,
+    ]  # fmt: skip
+
+
+def test_limits_in_the_wrong_order_are_refused() -> None:
+    """Catches a range that nothing can be in."""
+    with pytest.raises(ConfigurationError, match="lowest_rad"):
+        SafetyLimits(lowest_rad=1.0, highest_rad=-1.0)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[RunningEmulator]:
+    with RunningEmulator(EmulatorConfig(ids=(1, 2))) as running:
+        yield running
+
+
+@pytest.fixture
+def emulator(running: RunningEmulator) -> RunningEmulator:
+    """The one emulator, without the faults that a test before may have left."""
+    running.faults(overload=False, late=0, latency_s=0)
+    return running
+
+
+@pytest.fixture
+def supervised(emulator: RunningEmulator) -> Iterator[SupervisedBus]:
+    with SupervisedBus({emulator.port: [1, 2]}) as bus:
+        yield bus
+
+
+def cycle(bus: SupervisedBus, goals: list[float], number: int = 1) -> None:
+    for _ in range(number):
+        bus.exchange(np.array(goals), time.monotonic() + PERIOD_S)
+
+
+def torque_events(emulator: RunningEmulator, value: int) -> list[float]:
+    return [t for t, _, name, v in emulator.events() if name == "torque_enable" and v == value]
+
+
+def test_registers_and_positions_that_look_like_a_header_pass_both_ways(emulator: RunningEmulator) -> None:
+    """Catches the SDK's missing stuffing: −131073 is FF FF FD FF on the wire."""
+    with Bus(emulator.port) as bus:
+        assert [(f.servo_id, f.model_number) for f in (bus.ping(1), bus.ping(2))] == [(1, 54024), (2, 54024)]
+        bus.attach([1, 2])
+        for value in (-131_073, -131_072, -3, 250_961):
+            bus.write(1, "goal_position", value)
+            bus.write_all("goal_position", {2: value})
+            assert [bus.read(i, "goal_position") for i in (1, 2)] == [value, value]
+        with pytest.raises(ReplyError, match=r"servo 1 .*EEPROM"):
+            bus.write(1, "present_position", 0)
+        with pytest.raises(ReplyError, match=r"servo 9 at .* does not answer"):
+            bus.attach([9])
+
+
+def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -> None:
+    """Catches a check that reads the wrong register: the emulated servos are set as they should be."""
+    with Bus(emulator.port) as bus:
+        checks = check_bus(bus, [1, 2])
+    assert [one.what for one in checks if not one.is_good and "round trip" not in one.what] == []
+    assert any("54024 H54-200-S500-R" in one.value for one in checks)
+
+
+def test_slow_adapter_is_refused_with_its_cure(emulator: RunningEmulator) -> None:
+    """Catches a loop that would begin on an adapter as it is delivered: 16 ms, four control periods."""
+    emulator.faults(latency_s=0.016)
+    with pytest.raises(HardwareError, match=r"round trip .* is 1[67].*latency timer to 1 ms"):
+        SupervisedBus({emulator.port: [1]})
+
+
+def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator) -> None:
+    """Catches the SDK's habit of giving the answer of the last request to this one."""
+    with Bus(emulator.port) as bus:
+        bus.attach([1])
+        emulator.faults(late=1.0, late_s=0.006)
+        missing = 0
+        for _ in range(30):
+            begin = time.monotonic()
+            replied = bus.read_states(0.004)
+            missing += not replied.is_fresh.all()
+            # its own answer takes 6 ms; one that is there sooner is that of a request before
+            assert not replied.is_fresh.any() or replied.time_s - begin >= 0.006
+        emulator.faults(late=0)
+        assert missing > 10
+        assert bus.read_states(0.1).is_fresh.all()
+
+
+def test_second_program_is_told_which_port_is_taken(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
+    """Catches two programs on one bus, one directly and one through a supervisor."""
+    for intrude in (lambda: Bus(emulator.port).open(), lambda: SupervisedBus({emulator.port: [1]})):
+        with pytest.raises(PortError, match=emulator.port):
+            intrude()
+    assert supervised.read().is_fresh.all()
+
+
+def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator) -> None:
+    """Catches goals that do not arrive in the servos' units, and a program that ends with torque on."""
+    with SupervisedBus({emulator.port: [1, 2]}) as bus:
+        start = bus.enable(PATIENT)
+        begin = time.monotonic()
+        while (elapsed := time.monotonic() - begin) < 0.6:
+            share = min(elapsed / 0.4, 1.0)
+            cycle(bus, (start + share * (np.array([0.1, -0.1]) - start)).tolist())
+        assert emulator.state()["theta"] == pytest.approx([0.1, -0.1], abs=0.02)
+    assert emulator.state()["torque_on"] == [False, False]
+
+
+def test_torque_is_off_when_the_program_waits_too_long(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
+    """Catches a supervisor that waits for ever, and a program that is not told why nothing moves."""
+    supervised.enable(PATIENT.replace(hang_s=0.05))
+    emulator.events()
+    cycle(supervised, [0.0, 0.0], 3)
+    last = time.monotonic()
+    time.sleep(0.15)
+    off = torque_events(emulator, 0)
+    assert min(off) - last < 0.1
+    with pytest.raises(FaultError, match="no command for 50 ms"):
+        cycle(supervised, [0.0, 0.0])
+
+
+def test_overload_stops_all_and_is_named(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
+    """Catches an alert bit that is overlooked because it comes with success."""
+    supervised.enable(PATIENT)
+    emulator.faults(overload=True)
+    with pytest.raises(FaultError, match=r"torque is off \(servo 1 at .*overload"):
+        cycle(supervised, [0.0, 0.0], 12)
+    with pytest.raises(FaultError, match="overload"):
+        supervised.enable()
+    emulator.faults(overload=False)
+    assert emulator.state()["torque_on"] == [False, False]
+
+
+@pytest.mark.parametrize("how", ["kill", "stop", "interrupt", "kill-supervisor"])
+def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:
+    """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of the supervisor."""
+    command = [sys.executable, "-m", "train.wave", emulator.port, "1"]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        assert program.stdout is not None
+        supervisor = int(program.stdout.readline())
+        emulator.events()
+        begin = time.monotonic()
+        if how == "kill-supervisor":
+            os.kill(supervisor, signal.SIGKILL)
+        else:
+            program.send_signal({"kill": signal.SIGKILL, "stop": signal.SIGSTOP, "interrupt": signal.SIGINT}[how])
+        off: list[float] = []
+        while not off and time.monotonic() - begin < 1.0:
+            time.sleep(0.05)
+            off = torque_events(emulator, 0)
+        assert off
+        assert min(off) - begin < 0.1
+    finally:
+        program.kill()
+        program.communicate()
+        _wait_until_free(emulator.port)
+
+
+def _wait_until_free(port: str) -> None:
+    deadline = time.monotonic() + 3.0
+    while time.monotonic() < deadline:
+        try:
+            with Bus(port):
+                return
+        except PortError:
+            time.sleep(0.01)
+
+
+def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
+    """Catches arrays that mix up the servos of two buses, and one bus whose loss keeps torque on at the other."""
+    with RunningEmulator(EmulatorConfig(ids=(7,), model_number=2020)) as other:
+        ports = {other.port: [7], emulator.port: [1, 2]}
+        with SupervisedBus(ports) as bus:
+            assert bus.models == [[2020], [54024, 54024]]
+            bus.enable(PATIENT)
+            cycle(bus, [0.0, 0.0, 0.0], 5)
+            assert len(bus.read().position) == 3
+            other.faults(unplugged=True)
+            emulator.events()
+            with pytest.raises(BusGoneError, match=r"gone .*power"):
+                cycle(bus, [0.0, 0.0, 0.0], 12)
+            assert torque_events(emulator, 0)
+
+
+def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
+    """Catches registers of one model written to another."""
+    with RunningEmulator(EmulatorConfig(claimed_model_number=1020)) as strange:
+        with Bus(strange.port) as bus, pytest.raises(HardwareError, match="no control table for model number 1020"):
+            bus.attach([1])
+        assert strange.events() == []
+
+
+def test_no_port_says_what_there_is() -> None:
+    """Catches a traceback of the serial library."""
+    with pytest.raises(PortError, match="no such device"):
+        Buses([Bus("/dev/ttyNOTHING")]).buses[0].open()
+    with pytest.raises(PortError, match="57600"):
+        Bus("/dev/ttyNOTHING", baudrate=123).open()

@@ -1,0 +1,204 @@
+"""The environment on hardware, the IMU's stream and the commands, on an emulated bus."""
+
+import csv
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import baselines
+from elastic_env.entry_points import configure_testbed
+from elastic_env.errors import ConfigurationError
+from elastic_env.hardware.attitude import Attitude, AttitudeError, AttitudeStream, link_angle
+from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.settings import HardwareSettings
+from train.cli import main
+from train.hardware import hardware_arguments
+
+QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
+PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
+"""A busy computer delays pseudo-terminals."""
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[RunningEmulator]:
+    with RunningEmulator() as running:
+        yield running
+
+
+@pytest.fixture
+def emulator(running: RunningEmulator) -> RunningEmulator:
+    """The one emulator, without the faults that a test before may have left."""
+    running.faults(imu_silent=False, imu_corrupted=0)
+    return running
+
+
+def make_hardware(emulator: RunningEmulator, **arguments: Any) -> Any:
+    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0, "limits": PATIENT, "imu_oldest_s": 0.3}
+    given |= arguments
+    return gymnasium.make("elastic_env/HardwareTestbed-v0", disable_env_checker=True, port=emulator.port, **given)
+
+
+def play(env: Any, policy: Any) -> tuple[list[Any], dict[str, Any], float]:
+    observation, info = env.reset(seed=0)
+    seen, state, start, reward = [observation], None, np.array(True), 0.0
+    while True:
+        action, state = policy.predict(observation, state=state, episode_start=start)
+        observation, reward, terminated, truncated, info = env.step(action)
+        seen.append(observation)
+        start = np.array(False)
+        if terminated or truncated:
+            return seen, info, reward
+
+
+def test_hardware_has_the_spaces_the_keys_and_the_motion_of_the_simulation(emulator: RunningEmulator) -> None:
+    """Catches a policy that would see something else on the real joint: every column agrees with the simulation's."""
+    simulated: Any = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True, reference=QUICK)
+    real = make_hardware(emulator, imu_port=emulator.imu_port)
+    assert real.observation_space == simulated.observation_space
+    assert real.action_space == simulated.action_space
+    expected, told, _ = play(simulated, baselines.make("input", simulated))
+    seen, info, reward = play(real, baselines.make("input", real))
+    real.close()
+    assert set(info) >= set(told)
+    assert set(info["episode_metrics"]) >= set(told["episode_metrics"])
+    assert set(info) - set(told) == {"jitter", "period", "overruns", "missed_replies", "limited"}
+    last = np.array(seen[-1]), np.array(expected[-1])
+    np.testing.assert_allclose(last[0][[0, 5]], last[1][[0, 5]], atol=0.02)
+    np.testing.assert_array_equal(last[0][2:5], last[1][2:5])
+    assert info["link_angle"] == pytest.approx(told["link_angle"], abs=0.03)
+    assert np.isfinite(reward)
+    assert emulator.state()["torque_on"] == [False]
+
+
+def test_without_an_imu_the_link_is_unknown(emulator: RunningEmulator) -> None:
+    """Catches an encoder that is passed off as the link's angle, and a torque that is passed off as measured."""
+    env = make_hardware(emulator)
+    env.reset()
+    _, reward, _, _, info = env.step(np.zeros(1, dtype=np.float32))
+    unknown = {"link_angle", "link_angle_imu", "link_error", "link_error_imu", "deflection"}
+    assert {name for name in unknown if not np.isnan(info[name])} == set()
+    assert np.isnan(reward)
+    assert np.isfinite([info["joint_torque"], info["servo_error"], info["time_s"]]).all()
+    with pytest.raises(HardwareError, match="no truth"):
+        env.unwrapped.truth()
+    env.close()
+    assert emulator.state()["torque_on"] == [False]
+
+
+def test_nothing_moves_unless_somebody_agrees(emulator: RunningEmulator) -> None:
+    """Catches a motion that begins in a pipeline or a notebook without anybody there."""
+    emulator.events()
+    with pytest.raises(HardwareError, match="agree"):
+        make_hardware(emulator, confirm=True).reset()
+    assert emulator.events() == []
+
+
+def test_a_reference_beyond_the_limits_is_refused_before_anything_moves(emulator: RunningEmulator) -> None:
+    """Catches an episode that would be cut off by the limits half-way."""
+    with pytest.raises(HardwareError, match="limits allow"):
+        make_hardware(emulator, limits={"lowest_rad": -0.05})
+    for wrong, words in (({"prot": 1}, "port"), ({"scenario": "soft"}, "simulation"), ({"form": "rigid"}, "form")):
+        with pytest.raises(ConfigurationError if "prot" in wrong or "form" in wrong else HardwareError, match=words):
+            make_hardware(emulator, **wrong)
+
+
+def test_a_stalled_imu_ends_the_episode_with_torque_off(emulator: RunningEmulator) -> None:
+    """Catches an old attitude that is used as a new one."""
+    env = make_hardware(emulator, imu_port=emulator.imu_port)
+    env.reset()
+    emulator.faults(imu_silent=True)
+    with pytest.raises(AttitudeError, match="has sent no attitude"):
+        _step_for(env, 1.0)
+    assert emulator.state()["torque_on"] == [False]
+
+
+def _step_for(env: Any, duration_s: float) -> None:
+    begin = time.monotonic()
+    while time.monotonic() - begin < duration_s:
+        env.step(np.zeros(1, dtype=np.float32))
+
+
+def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: RunningEmulator) -> None:
+    """Catches a wrong field or byte order, and a packet that is taken in spite of its checksum."""
+    with AttitudeStream(emulator.imu_port, oldest_s=0.5) as stream:
+        emulator.faults(imu_corrupted=0.5)
+        rolls = []
+        for _ in range(40):
+            time.sleep(0.01)
+            rolls.append(stream.latest().roll)
+    assert np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01  # offset and noise of the scenario
+    with pytest.raises(AttitudeError, match="/dev/ttyNOTHING"):
+        AttitudeStream("/dev/ttyNOTHING")
+
+
+def test_mounting_turns_angles_into_the_joints() -> None:
+    """Catches a sign that is applied to the angle but not to the limits."""
+    mounting = HardwareSettings(port="p", direction=-1, zero_rad=0.5, limits={"lowest_rad": -1.0, "highest_rad": 0.3})  # type: ignore[arg-type]
+    assert mounting.joint_angle(mounting.servo_angle(0.7)) == pytest.approx(0.7)
+    assert mounting.servo_angle(0.2) == pytest.approx(0.3)
+    limits = mounting.servo_limits
+    assert (limits.lowest_rad, limits.highest_rad) == pytest.approx((0.2, 1.5))
+    assert link_angle(Attitude(0.0, 0.1, -0.2, 0.0), "pitch", -1, 0.05) == pytest.approx(0.15)
+    assert link_angle(Attitude(0.0, 3.0, 0.0, 0.0), "roll", 1, -0.5) == pytest.approx(3.5 - 2 * np.pi)
+
+
+def test_commands_run_on_hardware(
+    emulator: RunningEmulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches --port that is not passed on: evaluate and run play on the emulated joint with its mounting."""
+    residual = Path("baselines/trained/testbed/seed_0").absolute()
+    monkeypatch.chdir(tmp_path)
+    Path("mounting.yaml").write_text(
+        f"port: {emulator.port}\napproach_rad_s: 2.0\nimu_oldest_s: 0.3\n"
+        "limits: {patience_cycles: 10, hang_s: 0.09, slew_rad_s: 2.5}\n"
+    )
+    options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
+    assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5
+    reference = ["--reference", json.dumps(QUICK)]
+    main(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"])
+    (episode,) = csv.DictReader(Path("evaluated/episodes.csv").read_text().splitlines())
+    assert episode["scenario"] == "hardware"
+    assert 0.0 < float(episode["link_error_imu_rms_rad"]) < 0.05
+    main(["hardware", "run", *reference, *options, "--output", "run"])
+    rows = list(csv.DictReader(Path("run/log.csv").read_text().splitlines()))
+    assert len(rows) == 425
+    assert all(float(row["period"]) > 0.0 for row in rows)
+    main(["hardware", "scan", emulator.port, "--baudrate", "3000000"])
+    assert "H54-200-S500-R" in capsys.readouterr().out
+
+
+def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches an identification without the link's angle, and options of hardware that are silently ignored."""
+    for arguments, words in (
+        (["identify", "--port", "/dev/null"], "--imu-port"),
+        (["identify", "--yes"], "--port"),
+        (["evaluate", "--env", "walker", "--port", "/dev/null"], "testbed"),
+        (["hardware", "run"], "--port"),
+        (["hardware", "prove", "--only", "kiled"], "killed"),
+    ):
+        with pytest.raises(SystemExit):
+            main(arguments)
+        assert words in capsys.readouterr().err
+
+
+def test_the_links_deflection_is_that_of_the_emulated_spring() -> None:
+    """Catches counts, signs or angles that are off anywhere between the emulated joint and what a policy is told.
+
+    The joint is softer than the paper's, so that an assumed K would not pass, and damped, so that it settles quickly.
+    """
+    soft = configure_testbed(scenario="ideal", stiffness=300.0, joint={"damping": 60.0})
+    with RunningEmulator(EmulatorConfig(testbed=soft)) as emulator:
+        env = make_hardware(emulator, imu_port=emulator.imu_port, reference={"kind": "hold", "lower": -0.5})
+        _, info = env.reset()
+        env.close()
+    torque = soft.true_pendulum.torque(np.array(info["link_angle"]))
+    assert torque < -20.0
+    assert info["deflection"] == pytest.approx(torque / 300.0, rel=0.05)

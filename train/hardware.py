@@ -1,0 +1,163 @@
+"""Commands for the testbed on real hardware: scan, check, run, emulate."""
+
+import contextlib
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+import elastic_env  # noqa: F401  registers the environments
+from elastic_env.config import load_yaml
+from elastic_env.errors import ConfigurationError
+from elastic_env.hardware.attitude import AttitudeStream
+from elastic_env.hardware.bus import Bus
+from elastic_env.hardware.checks import Check, check_bus
+from elastic_env.hardware.control_table import servo_models
+from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.settings import HardwareSettings
+from train.conditions import PolicySpec
+from train.environments import environment
+from train.evaluate import make_policy
+from train.runs import run_folder
+
+_SCAN_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
+_SHOWN_S = 1.0
+
+
+def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | None, yes: bool) -> dict[str, Any]:
+    """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command; empty without hardware.
+
+    Args:
+        port: Port of the servo, or None for that of the settings.
+        imu_port: Port of the IMU, likewise.
+        settings: YAML file of `HardwareSettings`, or None.
+        yes: Whether nobody need agree before the first motion.
+
+    Raises:
+        ConfigurationError: There are options of hardware, but no port.
+    """
+    if port is None and settings is None:
+        if imu_port is not None or yes:
+            raise ConfigurationError("--imu-port and --yes are of hardware; it needs --port, or --mounting with a port")
+        return {}
+    given = HardwareSettings(port=str(port)) if settings is None else load_yaml(settings, HardwareSettings)
+    changes = {"port": port, "imu_port": imu_port, "confirm": False if yes else None}
+    chosen = given.replace(**{name: value for name, value in changes.items() if value is not None})
+    return {name: getattr(chosen, name) for name in chosen.model_fields_set | changes.keys()} | {
+        "limits": chosen.limits.model_dump()
+    }
+
+
+def scan(port: str, baudrate: int | None, console: Console) -> int:
+    """List the servos of a port; how many there are.
+
+    Args:
+        port: The port.
+        baudrate: Bits per second, or None to try the usual rates.
+        console: Where the table goes.
+    """
+    table = Table("bit/s", "id", "model number", "model", "firmware", title=f"servos at {port}")
+    number = 0
+    for rate in _SCAN_RATES if baudrate is None else (baudrate,):
+        with Bus(port, rate) as bus:
+            for found in bus.scan():
+                model = servo_models().get(found.model_number)
+                name = model.name if model is not None else "not known here"
+                table.add_row(str(rate), str(found.servo_id), str(found.model_number), name, str(found.firmware))
+                number += 1
+    if number:
+        console.print(table)
+    else:
+        console.print(f"no servo answers at {port}; check power, wiring and baud rate", soft_wrap=True)
+    return number
+
+
+def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, console: Console) -> bool:
+    """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
+    with Bus(port, baudrate) as bus:
+        checks = check_bus(bus, ids)
+    if imu_port is not None:
+        with AttitudeStream(imu_port) as stream:
+            sample = stream.latest()
+        angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in ("roll", "pitch", "yaw"))
+        checks.append(Check("IMU", f"{angles} rad"))
+    table = Table("", "", "what to do", title=f"check of {port}", show_header=True)
+    for one in checks:
+        style = "" if one.is_good else "bold yellow"
+        table.add_row(one.what, one.value, escape(one.cure) or "fine", style=style)
+    console.print(table)
+    return all(one.is_good for one in checks)
+
+
+def run(
+    arguments: dict[str, Any],
+    reference: Any,
+    policy: PolicySpec,
+    console: Console,
+    output: Path | None = None,
+) -> Path:
+    """Play one episode on hardware, show it as it goes, and keep every step in log.csv.
+
+    Args:
+        arguments: Of the environment.
+        reference: The motion.
+        policy: Who commands.
+        console: Where the progress goes.
+        output: Folder for the results; default runs/hardware, numbered if taken.
+
+    Returns:
+        The log.
+    """
+    env: Any = gymnasium.make(environment("hardware").id, disable_env_checker=True, reference=reference, **arguments)
+    try:
+        who = make_policy(policy, env)
+        configuration = {"policy": policy.model_dump(mode="json"), "reference": reference, **arguments}
+        with run_folder("hardware", configuration, None, output) as folder:
+            observation, _ = env.reset()
+            rows, state, start, period_s = [], None, np.array(True), env.unwrapped.task.config.control_period_s
+            while True:
+                action, state = who.predict(observation, state=state, episode_start=start, deterministic=True)
+                observation, _, _, truncated, info = env.step(action)
+                start = np.array(False)
+                rows.append({key: value for key, value in info.items() if not isinstance(value, dict)})
+                if len(rows) % round(_SHOWN_S / period_s) == 0:
+                    console.print(_line(rows[-1]))
+                if truncated:
+                    break
+            path = folder / "log.csv"
+            with path.open("w", newline="") as file:
+                writer = csv.DictWriter(file, list(rows[0]))
+                writer.writeheader()
+                writer.writerows(rows)
+            (folder / "metrics.json").write_text(json.dumps(info["episode_metrics"], indent=2) + "\n")
+            return path
+    finally:
+        env.close()
+
+
+def _line(info: dict[str, Any]) -> str:
+    return (
+        f"{info['time_s']:6.1f} s   q_ref {info['reference_angle']:+.4f}   link {info['link_angle']:+.4f} rad   "
+        f"torque {info['joint_torque']:+6.1f} N·m   jitter {1e3 * info['jitter']:+.2f} ms   "
+        f"overruns {info['overruns']}   missed {info['missed_replies']}"
+    )
+
+
+def emulate(config: EmulatorConfig, console: Console) -> None:
+    """Emulate until Ctrl-C."""
+    with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
+        console.print(f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True)
+        console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
+        console.print(
+            f"for example: elastic hardware check {emulator.port}, or\n"
+            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes\nCtrl-C ends it.",
+            soft_wrap=True,
+        )
+        emulator.wait()
