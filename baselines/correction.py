@@ -25,6 +25,7 @@ from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 Space = Literal["joint", "model"]
 
 _DEFAULT_SCALE = {"joint": 0.02, "model": 0.6}
+_WITH_OFFSETS = ("imu_attitude", "wrench")
 _MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "wrench", "link_angle_imu")
 
 
@@ -45,6 +46,14 @@ class ResidualSettings(Model):
     observe_errors: bool = False
     """Whether it sees differences to the plan too, which are small beside the observation: encoders less reference
     angles, and on the walker the measured ZMP and load share less the planned ones."""
+    detrend_s: float | None = quantity(
+        "s",
+        None,
+        gt=0,
+        description="time constant of slow means taken off attitude and wrenches",
+    )
+    """So that the residual sees how they change over a step, as they do where a model is wrong, and not what a slope or
+    a mounting error adds to them for good; None for what is measured."""
     history: int = quantity("1", 0, ge=0, description="measurements of earlier decisions that it sees as well")
 
     @model_validator(mode="after")
@@ -157,7 +166,7 @@ class Corrected:
 class Features:
     """What a residual is decided by: the observation, and if asked for the base's action and earlier measurements.
 
-    Memory per world: the measurements of the last decisions, the latest first.
+    Memory per world: the measurements of the last decisions, the latest first, and slow means.
 
     Args:
         corrected: The base and its correction.
@@ -165,13 +174,19 @@ class Features:
 
     def __init__(self, corrected: Corrected) -> None:
         self._corrected, settings, table = corrected, corrected.settings, corrected.model.observation_table
-        measured = [i for i, name in enumerate(table.names) if name.split(".")[0] in _MEASUREMENTS]
+        kinds = [name.split(".")[0] for name in table.names]
+        measured = [i for i, kind in enumerate(kinds) if kind in _MEASUREMENTS]
         self._measured, self._history = np.array(measured), settings.history
         action = len(corrected.model.joint_names) if settings.observe_base_action else 0
         self._errors = _errors_of(corrected.model) if settings.observe_errors else []
-        errors = sum(error(np.zeros((1, len(table)))).shape[1] for error in self._errors)
-        self.width = len(table) + action + errors + self._history * len(measured)
-        self.memory_width = self._history * len(measured)
+        errors = [error(np.zeros((1, len(table)))).shape[1] for error in self._errors]
+        slow = [i for i, kind in enumerate(kinds) if kind in _WITH_OFFSETS]
+        slow += [len(table) + i for i in range(sum(errors[:1]), sum(errors))]  # all but those of the encoders
+        self._slow = np.array(slow if settings.detrend_s is not None else [], dtype=np.int64)
+        period_s = settings.decision_period * corrected.model.control_period_s
+        self._gain = 1.0 if settings.detrend_s is None else 1.0 - float(np.exp(-period_s / settings.detrend_s))
+        self.width = len(table) + sum(errors) + action + self._history * len(measured)
+        self.memory_width = self._history * len(measured) + len(self._slow)
 
     def at(
         self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
@@ -188,15 +203,25 @@ class Features:
         Returns:
             (num_worlds, width) and (num_worlds, memory_width).
         """
-        measured = rows[:, self._measured]
-        repeated = np.tile(measured, (1, self._history))
-        past = repeated if memory is None else np.where(fresh[:, None], repeated, memory)
-        parts = [rows]
+        seen = np.concatenate([rows, *(error(rows) for error in self._errors)], axis=1)
+        slow, past = self._remembered(seen, memory, fresh)
+        seen[:, self._slow] -= slow
+        measured = seen[:, self._measured]
+        past = np.tile(measured, (1, self._history)) if past is None else past
+        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), past)
+        parts = [seen]
         if self._corrected.settings.observe_base_action:
             parts.append(np.asarray(self._corrected.base_action(rows, state, episode_start), dtype=np.float64))
-        parts += [error(rows) for error in self._errors]
-        features = np.concatenate([*parts, past], axis=1)
-        return features, np.concatenate([measured, past], axis=1)[:, : self.memory_width]
+        remembered = np.concatenate([measured, past], axis=1)[:, : past.shape[1]]
+        return np.concatenate([*parts, past], axis=1), np.concatenate([remembered, slow], axis=1)
+
+    def _remembered(self, seen: Array, memory: Array | None, fresh: BoolArray) -> tuple[Array, Array | None]:
+        """Slow means of now, and the measurements of earlier decisions."""
+        now = seen[:, self._slow]
+        if memory is None:
+            return now, None
+        past, slow = np.split(memory, [memory.shape[1] - len(self._slow)], axis=1)
+        return np.where(fresh[:, None], now, slow + self._gain * (now - slow)), past
 
 
 def _errors_of(model: RobotModel) -> list[Callable[[Array], Array]]:
