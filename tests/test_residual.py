@@ -348,6 +348,47 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     assert "no.zip is no model" in capsys.readouterr().err
 
 
+def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
+    """Catches a sign, a frame, the weight of the feet left out, and the wrong foot: held against the true ZMP."""
+    env: Any = vector("walker", 2, form="rigid", scenario="ideal")
+    corrected = around(env, "zero", space="joint", observe_errors=True)
+    table, features = env.unwrapped.assumed_model.observation_table, Features(corrected)
+    observation, info = env.reset(seed=0)
+    seen, true = [], []
+    for step in range(450):
+        errors = features.at(observation, None, np.ones(2, dtype=np.bool_), None, None)[0][:, len(table) :]
+        np.testing.assert_array_equal(
+            errors[:, :12],
+            observation[:, table.group("encoder_angle")] - observation[:, table.group("reference_angle")],
+        )
+        if step > 0:
+            seen.append(errors[:, 12:14])
+            true.append(np.stack([info[f"zmp_{axis}"] - info[f"zmp_reference_{axis}"] for axis in "xy"], axis=1))
+        observation, _, _, _, info = env.step(np.zeros((2, 12)))
+    difference = np.array(seen) - np.array(true)
+    assert np.sqrt(np.mean(np.square(true))) > 2e-3
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(difference), axis=(0, 1))), 0.0, atol=1e-3)
+
+
+def test_what_is_added_for_good_is_not_seen_without_slow_means() -> None:
+    """Catches a mean that is not taken off, taken off what moves, or carried into the next episode."""
+    env: Any = vector("walker", 2)
+    features = Features(around(env, "input_output", detrend_s=1.0, history=1))
+    table, generator = env.unwrapped.assumed_model.observation_table, np.random.default_rng(0)
+    offset = np.zeros((2, len(table)))
+    for group in ("imu_attitude", "wrench"):
+        offset[:, table.group(group)] = generator.normal(size=(2, len(np.arange(len(table))[table.group(group)])))
+    plain = shifted = None
+    for step in range(30):
+        rows, fresh = generator.normal(size=(2, len(table))), np.array([step in (0, 12), step == 0])
+        seen, plain = features.at(rows, plain, fresh, None, None)
+        same, shifted = features.at(rows + offset, shifted, fresh, None, None)
+        np.testing.assert_allclose(same, seen, rtol=0.0, atol=1e-12)
+        others = np.setdiff1d(np.arange(len(table)), np.flatnonzero(offset[0]))
+        np.testing.assert_array_equal(seen[:, others], rows[:, others])
+        assert (seen[fresh][:, np.flatnonzero(offset[0])] == 0.0).all()
+
+
 @pytest.mark.parametrize("name", shipped())
 def test_residuals_that_come_with_the_package_are_found_by_name(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
