@@ -31,7 +31,7 @@ demo: $(STAMP) ## Testbed and walker end to end: identify the spring, compensate
 	$(BIN)/elastic demo
 
 test: $(STAMP) ## Run the tests, without network or display
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 lint: $(STAMP) ## Check style, format and types; changes nothing
 	$(BIN)/ruff check .
