@@ -164,7 +164,9 @@ class Corrected:
 
 
 class Features:
-    """What a residual is decided by: the observation, and if asked for the base's action and earlier measurements.
+    """What a residual is decided by: the observation, and what `ResidualSettings` asks for beside it.
+
+    Their order is observation, errors, base action, earlier measurements.
 
     Memory per world: the measurements of the last decisions, the latest first, and slow means.
 
@@ -245,7 +247,7 @@ class _ContactErrors:
         rigid = biped.rigid
         feet = [rigid.body(f"{side}_foot").id for side in SIDES]
         self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
-        self._ankles = np.pad(biped.footholds, ((0, 0), (0, 1)), constant_values=biped.ankle_height)
+        self._ankles = biped.ankles
 
     def __call__(self, rows: Array) -> Array:
         wrench = rows[:, self._wrench].reshape(-1, 2, 2, 3)

@@ -387,6 +387,11 @@ def test_what_is_added_for_good_is_not_seen_without_slow_means() -> None:
         others = np.setdiff1d(np.arange(len(table)), np.flatnonzero(offset[0]))
         np.testing.assert_array_equal(seen[:, others], rows[:, others])
         assert (seen[fresh][:, np.flatnonzero(offset[0])] == 0.0).all()
+    rows, memory = np.zeros((2, len(table))), None
+    _, memory = features.at(rows, memory, np.ones(2, dtype=np.bool_), None, None)
+    for decision in range(1, 20):  # a step is forgotten with the time constant, at 0.1 s per decision
+        seen, memory = features.at(rows + (offset != 0.0), memory, np.zeros(2, dtype=np.bool_), None, None)
+        np.testing.assert_allclose(seen[:, table.group("wrench")], math.exp(-0.1 * decision / 1.0), rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", shipped())

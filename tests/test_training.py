@@ -296,6 +296,20 @@ def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: st
         Training(TrainConfig(**{**SMALL, **PPO, **changes}), 0, tmp_path / "x")
 
 
+def test_a_candidate_that_falls_comes_last(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches an early end that pays: it spares the penalties of the rest of the episode."""
+    search = ConstantSearch(TrainConfig(**SEARCH), 0, tmp_path)
+    step = search._worlds.step
+
+    def falling(residuals: Array) -> Any:
+        observation, reward, terminated, truncated, info = step(residuals)
+        return observation, reward, terminated | (np.arange(8) == 3), truncated, info
+
+    monkeypatch.setattr(search._worlds, "step", falling)
+    costs = search._play(np.zeros((8, 1)))
+    assert costs[3] > 10.0 * np.delete(costs, 3).max()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

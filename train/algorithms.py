@@ -6,6 +6,7 @@ from typing import Any
 import stable_baselines3
 
 from elastic_env.errors import ConfigurationError, unknown_name
+from train.train_config import CONSTANTS
 
 
 def algorithm_class(name: str) -> Any:
@@ -22,5 +23,5 @@ def algorithm_class(name: str) -> Any:
             raise ConfigurationError(f"algorithm {name!r}: {error}") from None
     known = ("A2C", "PPO", "SAC")
     if name not in known:
-        raise unknown_name("algorithm", name, [*known, "CMA-ES", "module:Class"])
+        raise unknown_name("algorithm", name, [*known, CONSTANTS, "module:Class"])
     return getattr(stable_baselines3, name)

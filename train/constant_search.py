@@ -20,6 +20,8 @@ from train.trainer import Trainer
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
 _CHECKPOINT = "checkpoint.json"
+_FALL_COST = 1e6
+"""Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its penalties."""
 
 
 class ConstantSearch(Trainer):
@@ -27,7 +29,8 @@ class ConstantSearch(Trainer):
 
     In space `model` the joints of the left and the right leg share their constant: robot and walk are symmetric, and
     half as many numbers are found in less time. All candidates of a generation play the same episodes, as many in every
-    scenario as the worlds allow, and are told the mean sum of rewards. The policy is the mean of the distribution.
+    scenario as the worlds allow, and are told the mean sum of rewards; who falls comes behind all who do not.
+    The policy is the mean of the distribution.
 
     Args:
         config: What is searched for; its algorithm_options may be population_size and sigma, in residuals.
@@ -109,7 +112,7 @@ class ConstantSearch(Trainer):
         self._told.append(costs.tolist())
 
     def _play(self, candidates: Array) -> Array:
-        """Minus the mean sum of rewards of each candidate over an episode, (population,)."""
+        """Cost of each candidate: minus its mean sum of rewards over an episode, and falls, (population,)."""
         n, scenarios = self._worlds.num_envs, len(self.config.scenarios)
         generation = len(self._told)
         own = self._first + generation * self._episodes + np.arange(self._episodes)
@@ -119,7 +122,7 @@ class ConstantSearch(Trainer):
         total, alive = np.zeros(n), np.ones(n, dtype=np.bool_)
         while alive.any():
             _, reward, terminated, truncated, _ = self._worlds.step(residuals)
-            total += np.where(alive, reward, 0.0)
+            total += np.where(alive, reward - _FALL_COST * terminated, 0.0)
             self._done += int(alive.sum())
             alive &= ~(terminated | truncated)
         return -total.reshape(scenarios, self._population, self._episodes).mean(axis=(0, 2))

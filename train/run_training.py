@@ -11,13 +11,11 @@ from elastic_env.errors import ConfigurationError
 from train.environments import environment
 from train.progress import read_progress
 from train.runs import new_run
-from train.train_config import TrainConfig
+from train.train_config import CONSTANTS, TrainConfig
 from train.trainer import Trainer
 from train.workers import progress_bar, side_by_side
 
 _CONFIG = "config.yaml"
-CONSTANTS = "CMA-ES"
-"""Algorithm that searches constants instead of training a network."""
 
 
 def start(config: TrainConfig, console: Console, output: Path | None = None, jobs: int = 1) -> Path:

@@ -18,6 +18,8 @@ from train.residual_env import ResidualVectorWrapper
 
 FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
 """Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""
+CONSTANTS = "CMA-ES"
+"""Algorithm that searches constants instead of training a network."""
 TRAINING_SEED_STRIDE = 100_000
 """Distance of the episodes of two training seeds."""
 

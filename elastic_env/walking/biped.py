@@ -61,6 +61,11 @@ class Biped:
         """Middles of the soles where the robot walks in place, under the hips, (2, 2) [m]."""
         return self.hips[:, :2]
 
+    @property
+    def ankles(self) -> Array:
+        """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
+        return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
+
     def joint_angles(self, pelvis: Array, ankles: Array) -> Array:
         """Inverse kinematics with level pelvis and soles.
 

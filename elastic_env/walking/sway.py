@@ -61,7 +61,7 @@ def _rotations(x: Array) -> Array:
 def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
     """Joint angles that keep both soles on the ground for small pelvis motions, (n, 6) to (n, 12)."""
     R = _rotations(x)
-    ankles = np.pad(biped.footholds, ((0, 0), (0, 1)), constant_values=biped.ankle_height)
+    ankles = biped.ankles
     relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
     turned = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
     return leg_angles(biped.leg, relative, turned).reshape(len(x), -1)
