@@ -354,7 +354,7 @@ def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
     corrected = around(env, "zero", space="joint", observe_errors=True)
     table, features = env.unwrapped.assumed_model.observation_table, Features(corrected)
     observation, info = env.reset(seed=0)
-    seen, true = [], []
+    seen, true, share = [], [], []
     for step in range(450):
         errors = features.at(observation, None, np.ones(2, dtype=np.bool_), None, None)[0][:, len(table) :]
         np.testing.assert_array_equal(
@@ -363,8 +363,10 @@ def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
         )
         if step > 0:
             seen.append(errors[:, 12:14])
+            share.append(errors[:, 14])
             true.append(np.stack([info[f"zmp_{axis}"] - info[f"zmp_reference_{axis}"] for axis in "xy"], axis=1))
         observation, _, _, _, info = env.step(np.zeros((2, 12)))
+    assert np.sqrt(np.mean(np.square(share))) < 0.1  # half of the weight and more on the wrong foot
     difference = np.array(seen) - np.array(true)
     assert np.sqrt(np.mean(np.square(true))) > 2e-3
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(difference), axis=(0, 1))), 0.0, atol=1e-3)
