@@ -1,32 +1,27 @@
-"""A base policy corrected by a residual: what the residual acts on, how fast it can change, what it is decided by.
+"""A base policy corrected by a residual: what the residual acts on, and how fast it can change.
 
 The residual is a number in [−1, 1] for every corrected joint, decided once in `decision_period` control steps and
-passed through a first-order low-pass. It acts in one of two spaces:
+passed through a first-order low-pass, by what `baselines.features` says. It acts in one of two spaces:
 
 * `joint`: an offset of the command in rad, added to what the base commands;
 * `model`: a relative change r of the deflection K⁻¹τ that the base compensates, (1 + r) δ, in the command and in the
   encoder readings alike. Zero means that the model is right.
 """
 
-from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from baselines.policy import Action, ObservationView, Policy, resume
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.robots.robot_model import RobotModel, WalkerModel
-from elastic_env.robots.thormang import SIDES
+from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array, BoolArray, IntArray
-from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 
 Space = Literal["joint", "model"]
 
 _DEFAULT_SCALE = {"joint": 0.02, "model": 0.6}
-_WITH_OFFSETS = ("imu_attitude", "wrench")
-_MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "wrench", "link_angle_imu")
 
 
 class ResidualSettings(Model):
@@ -41,20 +36,13 @@ class ResidualSettings(Model):
     cutoff_hz: float = quantity("Hz", 2.0, gt=0, description="cut-off of the first-order low-pass of the correction")
     joints: tuple[str, ...] | None = None
     """Joints that are corrected, by the end of their names (ankle_roll means both); None for all."""
-    observe_base_action: bool = False
-    """Whether it sees what the base alone would command, beside the observation."""
-    observe_errors: bool = False
-    """Whether it sees differences to the plan too, which are small beside the observation: encoders less reference
-    angles, and on the walker the measured ZMP and load share less the planned ones."""
-    detrend_s: float | None = quantity(
-        "s",
-        None,
-        gt=0,
-        description="time constant of slow means taken off attitude and wrenches",
-    )
-    """So that the residual sees how they change over a step, as they do where a model is wrong, and not what a slope or
-    a mounting error adds to them for good; None for what is measured."""
-    history: int = quantity("1", 0, ge=0, description="measurements of earlier decisions that it sees as well")
+    shared: bool = False
+    """Whether left and right joints of the same name share their residual: there are half as many to explore, and one
+    that follows the step still tells the legs apart by which of them carries the robot."""
+    observe: tuple[str, ...] = Field(default=("observation",), min_length=1)
+    """What it sees: groups of the observation such as (clock, load_share), or all of it, and what
+    `baselines.features` makes of it and of the plan."""
+    history: int = quantity("1", 0, ge=0, description="earlier decisions whose measurements it sees as well")
 
     @model_validator(mode="after")
     def _scales_are_positive(self) -> Self:
@@ -72,6 +60,14 @@ class ResidualSettings(Model):
         if self.joints is None:
             return np.arange(len(names))
         return np.flatnonzero(np.any([_fitting(wanted, names) for wanted in self.joints], axis=0))
+
+    def residual_of(self, names: list[str]) -> IntArray:
+        """Which of the residuals corrects each corrected joint, (k,)."""
+        corrected = [names[joint] for joint in self.corrected_joints(names)]
+        if self.shared:
+            corrected = [name.removeprefix("l_").removeprefix("r_") for name in corrected]
+        order = list(dict.fromkeys(corrected))
+        return np.array([order.index(name) for name in corrected], dtype=np.int64)
 
     def scales(self, names: list[str]) -> Array:
         """Correction at a residual of 1 of every corrected joint, (k,).
@@ -120,14 +116,15 @@ class Corrected:
             )
         self.base, self.settings, self.model = base, settings, model
         self.joints = settings.corrected_joints(model.joint_names)
+        self._residual = settings.residual_of(model.joint_names)
         self._scales, self._num_joints = settings.scales(model.joint_names), len(model.joint_names)
         self._share = 1.0 - float(np.exp(-2.0 * np.pi * settings.cutoff_hz * model.control_period_s))
         self._view = ObservationView(model.observation_table, model.control_period_s)
 
     @property
-    def num_corrected(self) -> int:
-        """Joints that are corrected, k."""
-        return len(self.joints)
+    def num_residuals(self) -> int:
+        """Numbers that make up a residual, k."""
+        return int(self._residual.max()) + 1
 
     def act(
         self, observation: Array, residual: Array, state: Any = None, episode_start: Any = None
@@ -141,7 +138,7 @@ class Corrected:
             state, episode_start, rows, self._view, lambda: np.zeros((len(rows), self._num_joints))
         )
         wanted = np.zeros_like(correction)
-        wanted[:, self.joints] = self._scales * residual
+        wanted[:, self.joints] = self._scales * residual[:, self._residual]
         correction = correction + self._share * (wanted - correction)
         if self.settings.space == "model":
             action, inner = self.base.predict_corrected(observation, correction, inner, episode_start)  # type: ignore[attr-defined]
@@ -161,98 +158,3 @@ class Corrected:
         if self.settings.space == "model":
             return self.base.link_estimate(observation, inner, correction)  # type: ignore[attr-defined]
         return self.base.link_estimate(observation, inner)  # type: ignore[attr-defined]
-
-
-class Features:
-    """What a residual is decided by: the observation, and what `ResidualSettings` asks for beside it.
-
-    Their order is observation, errors, base action, earlier measurements.
-
-    Memory per world: the measurements of the last decisions, the latest first, and slow means.
-
-    Args:
-        corrected: The base and its correction.
-    """
-
-    def __init__(self, corrected: Corrected) -> None:
-        self._corrected, settings, table = corrected, corrected.settings, corrected.model.observation_table
-        kinds = [name.split(".")[0] for name in table.names]
-        measured = [i for i, kind in enumerate(kinds) if kind in _MEASUREMENTS]
-        self._measured, self._history = np.array(measured), settings.history
-        action = len(corrected.model.joint_names) if settings.observe_base_action else 0
-        self._errors = _errors_of(corrected.model) if settings.observe_errors else []
-        errors = [error(np.zeros((1, len(table)))).shape[1] for error in self._errors]
-        slow = [i for i, kind in enumerate(kinds) if kind in _WITH_OFFSETS]
-        slow += [len(table) + i for i in range(sum(errors[:1]), sum(errors))]  # all but those of the encoders
-        self._slow = np.array(slow if settings.detrend_s is not None else [], dtype=np.int64)
-        period_s = settings.decision_period * corrected.model.control_period_s
-        self._gain = 1.0 if settings.detrend_s is None else 1.0 - float(np.exp(-period_s / settings.detrend_s))
-        self.width = len(table) + sum(errors) + action + self._history * len(measured)
-        self.memory_width = self._history * len(measured) + len(self._slow)
-
-    def at(
-        self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
-    ) -> tuple[Array, Array]:
-        """Features of a decision, and the memory for the next one.
-
-        Args:
-            rows: Observations, (num_worlds, m).
-            memory: That of the last decision, (num_worlds, memory_width); None at the first.
-            fresh: Worlds that decide for the first time in their episode.
-            state: State of the corrected policy.
-            episode_start: Worlds whose episode begins, for the policy.
-
-        Returns:
-            (num_worlds, width) and (num_worlds, memory_width).
-        """
-        seen = np.concatenate([rows, *(error(rows) for error in self._errors)], axis=1)
-        slow, past = self._remembered(seen, memory, fresh)
-        seen[:, self._slow] -= slow
-        measured = seen[:, self._measured]
-        past = np.tile(measured, (1, self._history)) if past is None else past
-        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), past)
-        parts = [seen]
-        if self._corrected.settings.observe_base_action:
-            parts.append(np.asarray(self._corrected.base_action(rows, state, episode_start), dtype=np.float64))
-        remembered = np.concatenate([measured, past], axis=1)[:, : past.shape[1]]
-        return np.concatenate([*parts, past], axis=1), np.concatenate([remembered, slow], axis=1)
-
-    def _remembered(self, seen: Array, memory: Array | None, fresh: BoolArray) -> tuple[Array, Array | None]:
-        """Slow means of now, and the measurements of earlier decisions."""
-        now = seen[:, self._slow]
-        if memory is None:
-            return now, None
-        past, slow = np.split(memory, [memory.shape[1] - len(self._slow)], axis=1)
-        return np.where(fresh[:, None], now, slow + self._gain * (now - slow)), past
-
-
-def _errors_of(model: RobotModel) -> list[Callable[[Array], Array]]:
-    """Differences between measurement and plan as functions of observations, (num_worlds, m) to (num_worlds, k)."""
-    encoder, reference = (model.observation_table.group(name) for name in ("encoder_angle", "reference_angle"))
-    errors: list[Callable[[Array], Array]] = [lambda rows: rows[:, encoder] - rows[:, reference]]
-    return [*errors, _ContactErrors(model)] if isinstance(model, WalkerModel) else errors
-
-
-class _ContactErrors:
-    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less the planned ones.
-
-    Zero where the feet carry too little for a ZMP.
-    """
-
-    _LEAST_N = 50.0
-
-    def __init__(self, model: WalkerModel) -> None:
-        table, biped = model.observation_table, model.biped
-        self._wrench, self._share, self._zmp = (table.group(n) for n in ("wrench", "load_share", "zmp_reference"))
-        rigid = biped.rigid
-        feet = [rigid.body(f"{side}_foot").id for side in SIDES]
-        self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
-        self._ankles = biped.ankles
-
-    def __call__(self, rows: Array) -> Array:
-        wrench = rows[:, self._wrench].reshape(-1, 2, 2, 3)
-        force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
-        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
-        vertical = force[:, :, 2].sum(axis=1)
-        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan) - rows[:, self._share][:, 0]
-        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0)

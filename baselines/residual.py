@@ -14,7 +14,8 @@ from pydantic import field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from baselines.correction import Corrected, Features, ResidualSettings
+from baselines.correction import Corrected, ResidualSettings
+from baselines.features import Features
 from baselines.policy import Action, ObservationView, Policy, resume
 from elastic_env.config import Model
 from elastic_env.errors import ConfigurationError
@@ -139,7 +140,7 @@ class ResidualPolicy:
     def __init__(self, corrected: Corrected, network: Network) -> None:
         self.corrected, self._network = corrected, network
         self._features, self._period = Features(corrected), corrected.settings.decision_period
-        expected = self._features.width, corrected.num_corrected
+        expected = self._features.width, corrected.num_residuals
         if (network.num_features, network.num_outputs) != expected:
             raise ConfigurationError(
                 f"the network must take {expected[0]} features and give {expected[1]} residuals for these settings, "
@@ -157,7 +158,7 @@ class ResidualPolicy:
     ) -> tuple[Action, Any]:
         """Corrected action and new state."""
         rows = self._view.rows(observation)
-        k, width = self.corrected.num_corrected, 1 + self.corrected.num_corrected + self._features.memory_width
+        k, width = self.corrected.num_residuals, 1 + self.corrected.num_residuals + self._features.memory_width
         memory, inner = resume(state, episode_start, rows, self._view, lambda: self._undecided((len(rows), width)))
         due = np.flatnonzero((memory[:, 0] == 0.0) | (memory[:, 0] == _UNDECIDED))
         if len(due) > 0:

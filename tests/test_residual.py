@@ -17,7 +17,9 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
-from baselines.correction import Corrected, Features, ResidualSettings
+from baselines.bending import BendingObserver
+from baselines.correction import Corrected, ResidualSettings
+from baselines.features import Features
 from baselines.residual import (
     Network,
     ResidualDescription,
@@ -102,7 +104,7 @@ def test_a_zero_residual_is_the_base_to_the_last_bit(robot: str, base: str, spac
     expected = played(env, baselines.make(base, env), 250)
     corrected = around(env, base, space=space)
     for seen in (
-        played(env, Deciding(corrected, np.zeros((20, corrected.num_corrected))), 250),
+        played(env, Deciding(corrected, np.zeros((20, corrected.num_residuals))), 250),
         played(env, ResidualPolicy(corrected, nothing(corrected)), 250),
     ):
         assert len(seen) == len(expected) > 100
@@ -118,7 +120,7 @@ def nothing(corrected: Corrected) -> Network:
 def random_network(corrected: Corrected, size: float, seed: int = 0) -> Network:
     """A network of random weights."""
     features, generator = Features(corrected).width, np.random.default_rng(seed)
-    widths = [features, 8, corrected.num_corrected]
+    widths = [features, 8, corrected.num_residuals]
     tensors = {"mean": generator.normal(size=features), "std": generator.uniform(0.5, 2.0, features)}
     for i in range(2):
         tensors |= {
@@ -181,7 +183,7 @@ def test_joints_and_scales_are_chosen_by_name() -> None:
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 def test_a_vector_of_worlds_is_the_scalar_wrapper(robot: str, base: str, space: Any, mode: AutoresetMode) -> None:
     """Catches rewards that go on after an end, worlds that begin inside a decision, and memories that are mixed up."""
-    further = {"history": 2, "observe_base_action": True, "decision_period": 20}
+    further = {"history": 2, "observe": ["observation", "base_action"], "decision_period": 20}
     n, generator = 3, np.random.default_rng(0)
     many = ResidualVectorWrapper(vector(robot, n, mode), base, space=space, **further)
     ones = [ResidualWrapper(scalar(robot), base, space=space, **further) for _ in range(n)]
@@ -351,7 +353,7 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
 def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
     """Catches a sign, a frame, the weight of the feet left out, and the wrong foot: held against the true ZMP."""
     env: Any = vector("walker", 2, form="rigid", scenario="ideal")
-    corrected = around(env, "zero", space="joint", observe_errors=True)
+    corrected = around(env, "zero", space="joint", observe=("observation", "encoder_error", "contact_error"))
     table, features = env.unwrapped.assumed_model.observation_table, Features(corrected)
     observation, info = env.reset(seed=0)
     seen, true, share = [], [], []
@@ -372,28 +374,37 @@ def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(difference), axis=(0, 1))), 0.0, atol=1e-3)
 
 
-def test_what_is_added_for_good_is_not_seen_without_slow_means() -> None:
-    """Catches a mean that is not taken off, taken off what moves, or carried into the next episode."""
+def test_residuals_see_what_they_are_told_to() -> None:
+    """Catches another order, and a history of what is no measurement or of another group."""
     env: Any = vector("walker", 2)
-    features = Features(around(env, "input_output", detrend_s=1.0, history=1))
     table, generator = env.unwrapped.assumed_model.observation_table, np.random.default_rng(0)
-    offset = np.zeros((2, len(table)))
-    for group in ("imu_attitude", "wrench"):
-        offset[:, table.group(group)] = generator.normal(size=(2, len(np.arange(len(table))[table.group(group)])))
-    plain = shifted = None
-    for step in range(30):
-        rows, fresh = generator.normal(size=(2, len(table))), np.array([step in (0, 12), step == 0])
-        seen, plain = features.at(rows, plain, fresh, None, None)
-        same, shifted = features.at(rows + offset, shifted, fresh, None, None)
-        np.testing.assert_allclose(same, seen, rtol=0.0, atol=1e-12)
-        others = np.setdiff1d(np.arange(len(table)), np.flatnonzero(offset[0]))
-        np.testing.assert_array_equal(seen[:, others], rows[:, others])
-        assert (seen[fresh][:, np.flatnonzero(offset[0])] == 0.0).all()
-    rows, memory = np.zeros((2, len(table))), None
-    _, memory = features.at(rows, memory, np.ones(2, dtype=np.bool_), None, None)
-    for decision in range(1, 20):  # a step is forgotten with the time constant, at 0.1 s per decision
-        seen, memory = features.at(rows + (offset != 0.0), memory, np.zeros(2, dtype=np.bool_), None, None)
-        np.testing.assert_allclose(seen[:, table.group("wrench")], math.exp(-0.1 * decision / 1.0), rtol=1e-12)
+    features = Features(around(env, "input_output", observe=("imu_rate", "clock", "bending"), history=2))
+    rates = np.arange(len(table))[table.group("imu_rate")]
+    rows, memory, seen = generator.normal(size=(5, 2, len(table))), None, np.zeros((2, 0))
+    for decision in range(5):
+        fresh = np.array([decision in (0, 3), decision == 0])
+        seen, memory = features.at(rows[decision], memory, fresh, None, None)
+    assert seen.shape == (2, features.width) == (2, 3 + 3 + len(BendingObserver.names) + 2 * 3)
+    np.testing.assert_array_equal(seen[:, :3], rows[4][:, rates])
+    np.testing.assert_array_equal(seen[:, 3:6], rows[4][:, table.group("clock")])
+    np.testing.assert_array_equal(seen[1, -6:], np.concatenate([rows[3][1, rates], rows[2][1, rates]]))
+    np.testing.assert_array_equal(seen[0, -6:], np.concatenate([rows[3][0, rates], rows[3][0, rates]]))
+
+
+@pytest.mark.parametrize(
+    ("robot", "observe", "message"),
+    [
+        ("testbed", ("bending",), "'bending'"),
+        ("walker", ("clocks",), "clock"),
+        ("walker", ("observation", "clock"), "clock are there twice"),
+        ("walker", (), "observe"),
+    ],
+)
+def test_features_that_do_not_exist_are_refused(robot: str, observe: tuple[str, ...], message: str) -> None:
+    """Catches a name that is ignored, and a message that does not help."""
+    base = "input" if robot == "testbed" else "input_output"
+    with pytest.raises(ConfigurationError, match=message):
+        Features(around(vector(robot, 2), base, observe=observe))
 
 
 @pytest.mark.parametrize("name", shipped())
@@ -410,9 +421,12 @@ def test_residuals_that_come_with_the_package_are_found_by_name(
 def test_a_residual_of_a_folder_plays_what_the_wrapper_decided(tmp_path: Path) -> None:
     """Catches a policy that decides at other steps, on other features, or around another base than in training."""
     env = scalar("walker")
-    corrected = around(env, "input_output", history=2, observe_base_action=True, decision_period=10)
+    settings: Any = {"history": 2, "observe": ("observation", "base_action"), "decision_period": 10}
+    corrected = around(env, "input_output", **settings)
     network = random_network(corrected, 0.3)
-    wrapper = ResidualWrapper(scalar("walker"), "input_output", history=2, observe_base_action=True, decision_period=10)
+    wrapper = ResidualWrapper(
+        scalar("walker"), "input_output", history=2, observe=("observation", "base_action"), decision_period=10
+    )
     features, _ = wrapper.reset(seed=3)
     seen = played(env, ResidualPolicy(corrected, network), 60)
     for decision in range(6):

@@ -27,8 +27,7 @@ _FALL_COST = 1e6
 class ConstantSearch(Trainer):
     """One training seed of a search, in a folder of its own.
 
-    In space `model` the joints of the left and the right leg share their constant: robot and walk are symmetric, and
-    half as many numbers are found in less time. All candidates of a generation play the same episodes, as many in every
+    All candidates of a generation play the same episodes, as many in every
     scenario as the worlds allow, and are told the mean sum of rewards; who falls comes behind all who do not.
     The policy is the mean of the distribution.
 
@@ -58,13 +57,7 @@ class ConstantSearch(Trainer):
         self._episodes, self._first = episodes, FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
         shares = [(scenario, episodes * self._population) for scenario in config.scenarios]
         self._worlds = training_worlds(config, shares, threads)
-        first: Any = self._worlds.envs[0]
-        names = first.unwrapped.assumed_model.joint_names
-        corrected = [names[joint] for joint in config.settings.corrected_joints(names)]
-        if config.settings.space == "model":
-            corrected = [name.removeprefix("l_").removeprefix("r_") for name in corrected]
-        self._groups = np.unique(corrected, return_inverse=True)[1]
-        num_constants = int(self._groups.max()) + 1
+        (num_constants,) = self._worlds.single_action_space.shape or (0,)
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
         self._optimiser = CMA(
             mean=np.zeros(num_constants), sigma=float(options["sigma"]), bounds=bounds, seed=seed,
@@ -118,7 +111,7 @@ class ConstantSearch(Trainer):
         own = self._first + generation * self._episodes + np.arange(self._episodes)
         self._worlds.reset(seed=np.tile(own, n // self._episodes).tolist())
         # worlds in the order scenario, candidate, episode
-        residuals = np.tile(np.repeat(candidates[:, self._groups], self._episodes, axis=0), (scenarios, 1))
+        residuals = np.tile(np.repeat(candidates, self._episodes, axis=0), (scenarios, 1))
         total, alive = np.zeros(n), np.ones(n, dtype=np.bool_)
         while alive.any():
             _, reward, terminated, truncated, _ = self._worlds.step(residuals)
@@ -129,7 +122,7 @@ class ConstantSearch(Trainer):
 
     def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
         """The mean of the distribution as a network whose output does not depend on its input."""
-        constants = self._optimiser.mean[self._groups]
+        constants = self._optimiser.mean
         (features,) = self._worlds.single_observation_space.shape or (0,)
         tensors = {
             "mean": np.zeros(features),

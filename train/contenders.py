@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from baselines.correction import Corrected, Features, ResidualSettings
+from baselines.correction import Corrected, ResidualSettings
+from baselines.features import Features
 from baselines.residual import Network, ResidualDescription, ResidualPolicy
 from elastic_env.signals import Array
 from train.conditions import Condition, PolicySpec
@@ -271,7 +272,7 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     space = "model" if hasattr(base, "predict_corrected") else "joint"
     corrected = Corrected(base, env.unwrapped.assumed_model, ResidualSettings(space=space))
     features, generator = Features(corrected).width, np.random.default_rng(0)
-    widths = [features, 64, 64, corrected.num_corrected]
+    widths = [features, 64, 64, corrected.num_residuals]
     tensors = {"mean": np.zeros(features), "std": np.ones(features)}
     for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
         tensors |= {f"weight{i}": 0.01 * generator.normal(size=(outputs, inputs)), f"bias{i}": np.zeros(outputs)}

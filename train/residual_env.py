@@ -14,7 +14,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import baselines
-from baselines.correction import Corrected, Features, ResidualSettings, Space
+from baselines.correction import Corrected, ResidualSettings, Space
+from baselines.features import Features
 from baselines.policy import Policy
 from elastic_env.errors import ActionError, ConfigurationError
 from elastic_env.signals import Array, BoolArray
@@ -97,7 +98,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         gymnasium.Wrapper.__init__(self, env)
         self._deciding = _Deciding(env, base_policy, _settings(space, scale, decision_period, settings), 1)
         self.observation_space = _box(self._deciding.features.width)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._deciding.corrected.num_corrected,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32)
         self._last = np.zeros(0)
 
     @property
@@ -160,7 +161,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self.metadata = {**inner.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = _box(self._deciding.features.width)
         self.single_action_space = gymnasium.spaces.Box(
-            -1.0, 1.0, (self._deciding.corrected.num_corrected,), np.float32
+            -1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32
         )
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self.action_space = batch_space(self.single_action_space, env.num_envs)

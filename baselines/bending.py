@@ -1,0 +1,138 @@
+r"""How much more a walker's joints bend than the model says, from what their motors and the IMU disagree on.
+
+A sole lies flat on the ground. By the motors' angles θ and the attitude of the IMU it seems to be tilted: by what the
+joints of its leg bend, δ = θ − q about their axes z, and by what never changes, the tilt of the ground and the errors
+of homing and of the mounting,
+
+.. math:: e = \sum_j z_j \delta_j + c
+
+The model and the measured foot wrenches say how much bending to expect, s = Σ z_j K⁻¹τ_j. With a common relative error
+ρ of that leg's model, e = (1 + ρ) s + c. Bending comes and goes with the load and c does not, so that recursive least
+squares over the time that a foot is loaded tell ρ from c, for roll and pitch of each leg [Kalman1960, without drift].
+
+The ground's mean force leans by as much as the ground is tilted, whatever bends. The attitude less that lean is a tilt
+that the robot made itself.
+
+[Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic Eng. 82.
+"""
+
+import numpy as np
+
+from baselines.compensators import GravityCompensator
+from elastic_env.robots.robot_model import WalkerModel
+from elastic_env.signals import Array, BoolArray
+from elastic_env.walking.leg_chains import Vector
+from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+
+LOADED_SHARE = 0.15
+"""Share of the weight from which a foot counts as flat on the ground."""
+MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
+"""Standard deviations before the first measurement, of ρ and c, and of a measurement."""
+
+_UNKNOWNS = 2  # ρ and c
+_FILTERS = (2, 2)  # legs, roll and pitch
+_ESTIMATE, _VARIANCES = 8, 12  # per world: (legs, axes, unknowns) and (legs, axes, upper triangle)
+
+
+class BendingObserver:
+    """Estimates of the model's error and of the robot's own tilt, from the observations of a walker.
+
+    Memory per world: measurements so far, mean lean of the ground's force, estimates, their covariance.
+
+    Args:
+        model: Assumed walker.
+        period_s: Time between measurements [s].
+        mean_s: Time constant of the mean lean, after as much time [s].
+    """
+
+    names = (
+        *(f"model_error.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
+        "own_tilt.roll",
+        "own_tilt.pitch",
+        "excess_load",
+    )
+    """What `observe` returns: ρ [1], tilt [rad], measured over assumed load less one [1]."""
+    width = len(names)
+    memory_width = 1 + 2 + _ESTIMATE + _VARIANCES
+
+    def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
+        self._model, self._compensator = model, GravityCompensator(model, output="wrench")
+        table = model.observation_table
+        self._theta, self._attitude = table.group("encoder_angle"), table.group("imu_attitude")
+        self._wrench = table.group("wrench")
+        self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
+        self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
+
+    def begin(self, num_worlds: int) -> Array:
+        """Memory before the first measurement, (num_worlds, memory_width)."""
+        memory = np.zeros((num_worlds, self.memory_width))
+        prior = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
+        memory[:, -_VARIANCES:] = np.tile(prior, 4)
+        return memory
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """Estimates after a measurement, see `names`, and the new memory.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            memory: (num_worlds, memory_width).
+        """
+        n = len(rows)
+        force = rows[:, self._wrench].reshape(n, 2, 2, 3)[:, :, 0]
+        loaded: BoolArray = np.asarray(force[..., 2] >= LOADED_SHARE * self._carried)
+        counted, lean, estimate, variances = np.split(memory, np.cumsum([1, 2, _ESTIMATE]), axis=1)
+        counted = counted + 1.0
+        gain = np.maximum(1.0 / counted, self._least_gain)
+        lean = lean + gain * np.where(loaded.any(axis=1, keepdims=True), _lean(force) - lean, 0.0)
+        seen, expected = self.disagreement(rows)
+        x, P = estimate.reshape(n, *_FILTERS, _UNKNOWNS), _symmetric(variances.reshape(n, *_FILTERS, 3))
+        x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
+        upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
+        excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0
+        estimates = np.hstack([x[..., 0].reshape(n, -1), rows[:, self._attitude] - lean, excess])
+        return estimates, np.hstack([counted, lean, x.reshape(n, -1), upper])
+
+    def disagreement(self, rows: Array) -> tuple[Array, Array]:
+        """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a foot that is flat.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+
+        Returns:
+            (num_worlds, 2 legs, 2) each, roll and pitch [rad].
+        """
+        theta, attitude = rows[:, self._theta], rows[:, self._attitude]
+        bending = theta - self._compensator.at(rows).link_angle(theta, theta)
+        bent = bending.reshape(len(rows), 2, -1).transpose(2, 0, 1)
+        chains = self._model.biped.chains
+        posture = chains.posture(theta.reshape(len(rows), 2, -1))
+        zero: Array = np.zeros(bent.shape[1:])
+        normal: Vector = [zero, zero, zero + 1.0]
+        turn: Vector = [zero, zero, zero]
+        for j in range(len(chains.axis) - 1, -1, -1):
+            normal, turn = posture.into_parent(j, normal), posture.into_parent(j, turn)
+            turn[chains.axis[j]] = turn[chains.axis[j]] + bent[j]
+        R = (rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])).swapaxes(-1, -2)
+        up, expected = np.stack(normal, axis=-1) @ R, np.stack(turn, axis=-1) @ R
+        return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
+
+
+def _lean(force: Array) -> Array:
+    """Roll and pitch of ground whose force on level feet is this, (n, legs, 3) [N] to (n, 2) [rad]."""
+    x, y, z = force.sum(axis=1).T
+    z = np.maximum(z, 1.0)
+    return np.stack([y / z, -x / z], axis=1)
+
+
+def _symmetric(upper: Array) -> Array:
+    first, mixed, second = np.moveaxis(upper, -1, 0)
+    return np.stack([np.stack([first, mixed], axis=-1), np.stack([mixed, second], axis=-1)], axis=-2)
+
+
+def _least_squares(x: Array, P: Array, expected: Array, excess: Array, valid: BoolArray) -> tuple[Array, Array]:
+    """One step of recursive least squares for excess = ρ · expected + c, where it is valid."""
+    h = np.stack([expected, np.ones_like(expected)], axis=-1)
+    Ph = (P @ h[..., None])[..., 0]
+    gain = Ph / ((h * Ph).sum(axis=-1) + DISAGREEMENT_RAD**2)[..., None] * valid[..., None]
+    x = x + gain * (excess - (h * x).sum(axis=-1))[..., None]
+    return x, P - gain[..., :, None] * Ph[..., None, :]

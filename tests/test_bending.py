@@ -1,0 +1,135 @@
+"""What the observer of the bending says: against closed forms, a batch regression, and the springs of the plant."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+import baselines
+import elastic_env  # noqa: F401  registers the environments
+from baselines.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver, _least_squares
+from elastic_env.signals import Array
+
+PERIOD_S = 0.1
+
+
+def walker(scenario: str, num_envs: int = 2) -> Any:
+    """A walk of two fast steps."""
+    return gymnasium.make_vec(
+        "elastic_env/WalkInPlace-v0", num_envs=num_envs, vectorization_mode="vector_entry_point", num_threads=1,
+        scenario=scenario, step_period=1.6, num_steps=2,
+    )  # fmt: skip
+
+
+def observed(scenario: str, num_envs: int = 2) -> tuple[Array, Array]:
+    """Estimates at the end of a compensated walk, (num_envs, 7), and the attitude that the IMU shows there."""
+    env = walker(scenario, num_envs)
+    policy, observer = baselines.make("input_output", env), BendingObserver(env.unwrapped.assumed_model, PERIOD_S)
+    attitude = env.unwrapped.assumed_model.observation_table.group("imu_attitude")
+    (observation, _), state, memory = env.reset(seed=5), None, observer.begin(num_envs)
+    estimates, shown = np.zeros((num_envs, 7)), np.zeros((num_envs, 2))
+    for step in range(env.unwrapped.task.num_steps - 1):
+        if step % 25 == 0:
+            estimates, memory = observer.observe(observation, memory)
+            shown = observation[:, attitude]
+        action, state = policy.predict(observation, state, np.full(num_envs, step == 0))
+        observation, *_ = env.step(action)
+    return estimates, shown
+
+
+@pytest.fixture(scope="module")
+def level() -> Array:
+    """Estimates on ideal springs and a level floor."""
+    return observed("ideal")[0]
+
+
+def test_springs_that_are_as_assumed_show_no_error(level: Array) -> None:
+    """Catches a wrong axis or sign, a torque taken at the motors' angles, a swinging foot that counts."""
+    np.testing.assert_allclose(level[:, :4], 0.0, atol=0.03)
+    np.testing.assert_allclose(level[:, 6], 0.0, atol=0.02)
+
+
+def test_softer_springs_show_by_how_much() -> None:
+    """K × 0.7 bends 1 / 0.7 − 1 = 0.43 more, however the load is shared."""
+    estimates, _ = observed("ideal+soft")
+    np.testing.assert_allclose(estimates[:, [0, 2]], 1.0 / 0.7 - 1.0, atol=0.04)
+    assert (estimates[:, [1, 3]] > 0.2).all()
+
+
+def test_heavier_robots_show_in_the_load() -> None:
+    """5 kg on some 54 kg, and no other springs."""
+    estimates, _ = observed("ideal+payload")
+    np.testing.assert_allclose(estimates[:, 6], 0.09, atol=0.01)
+    np.testing.assert_allclose(estimates[:, [0, 2]], 0.0, atol=0.1)
+
+
+def test_tilted_ground_is_not_taken_for_bending(level: Array) -> None:
+    """Catches a lean of the wrong sign or axis, and an offset that leaks into the model's error."""
+    estimates, attitude = observed("ideal+slope", 4)
+    assert np.hypot(*(attitude - level[0, 4:6]).T).min() > 0.01  # 17 mrad of slope, in any direction
+    np.testing.assert_allclose(estimates[:, 4:6] - level[0, 4:6], 0.0, atol=7e-3)  # it does lean by itself, too
+    np.testing.assert_allclose(estimates[:, :4] - level[0, :4], 0.0, atol=0.05)
+
+
+def test_soles_of_bent_legs_seem_tilted() -> None:
+    """Orientations by SciPy: of the pelvis as the IMU has it, and of the joints one after the other."""
+    model = walker("ideal").unwrapped.assumed_model
+    observer, table = BendingObserver(model, PERIOD_S), model.observation_table
+    generator, rows = np.random.default_rng(0), np.zeros((6, len(table)))
+    theta, attitude = 0.3 * generator.normal(size=(6, 12)), 0.02 * generator.normal(size=(6, 2))
+    rows[:, table.group("encoder_angle")], rows[:, table.group("imu_attitude")] = theta, attitude
+    seen, _ = observer.disagreement(rows)
+    pelvis = Rotation.from_euler("xy", attitude)
+    for leg in range(2):
+        yaw, roll, pitch, knee, ankle_pitch, ankle_roll = theta[:, 6 * leg : 6 * leg + 6].T
+        joints = Rotation.from_euler("ZXY", np.stack([yaw, roll, pitch + knee + ankle_pitch], axis=1))
+        joints = joints * Rotation.from_euler("X", ankle_roll[:, None])
+        normal = (pelvis * joints).apply([0.0, 0.0, 1.0])
+        np.testing.assert_allclose(seen[:, leg], np.stack([-normal[:, 1], normal[:, 0]], axis=1), atol=1e-12)
+
+
+def test_expected_bending_turns_the_soles_as_its_joints_do() -> None:
+    """Finite difference: the tilt of the soles by motors that stand where the links are expected, to first order."""
+    env = walker("ideal")
+    model = env.unwrapped.assumed_model
+    observer, theta = BendingObserver(model, PERIOD_S), model.observation_table.group("encoder_angle")
+    rows = env.reset(seed=0)[0]
+    seen, expected = observer.disagreement(rows)
+    bent = rows[:, theta] - observer._compensator.at(rows).link_angle(rows[:, theta], rows[:, theta])
+    ahead, behind = rows.copy(), rows.copy()
+    ahead[:, theta] += 1e-3 * bent
+    behind[:, theta] -= 1e-3 * bent
+    slope = (observer.disagreement(ahead)[0] - observer.disagreement(behind)[0]) / 2e-3
+    np.testing.assert_allclose(slope, expected, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(seen, expected, rtol=0.03, atol=5e-4)  # the robot stands
+
+
+def test_least_squares_are_those_of_a_batch() -> None:
+    """Ridge regression over all measurements at once, with the prior as further rows."""
+    generator, expected = np.random.default_rng(1), np.random.default_rng(2).normal(0.0, 0.04, size=40)
+    excess = 0.4 * expected + 0.01 + generator.normal(0.0, DISAGREEMENT_RAD, size=40)
+    valid = generator.random(40) < 0.7
+    x, P = np.zeros((1, 2)), np.diag([MODEL_ERROR**2, OFFSET_RAD**2])[None]
+    for s, e, v in zip(expected, excess, valid, strict=True):
+        x, P = _least_squares(x, P, np.array([s]), np.array([e]), np.array([v]))
+    rows = np.stack([expected, np.ones(40)], axis=1)[valid] / DISAGREEMENT_RAD
+    rows = np.vstack([rows, np.diag([1.0 / MODEL_ERROR, 1.0 / OFFSET_RAD])])
+    sought = np.concatenate([excess[valid] / DISAGREEMENT_RAD, [0.0, 0.0]])
+    np.testing.assert_allclose(x[0], np.linalg.lstsq(rows, sought, rcond=None)[0], rtol=1e-9)
+    np.testing.assert_allclose(P[0], np.linalg.inv(rows.T @ rows), rtol=1e-9)
+    assert stats.norm.sf(abs(x[0, 0] - 0.4) / np.sqrt(P[0, 0, 0])) > 1e-3
+
+
+def test_unloaded_feet_say_nothing() -> None:
+    """Catches estimates that move while a foot swings."""
+    model = walker("ideal").unwrapped.assumed_model
+    observer, generator = BendingObserver(model, PERIOD_S), np.random.default_rng(3)
+    rows = generator.normal(0.0, 0.02, size=(3, len(model.observation_table)))
+    rows[:, model.observation_table.group("wrench")] = 0.0
+    estimates, memory = observer.observe(rows, observer.begin(3))
+    np.testing.assert_array_equal(estimates[:, :4], 0.0)
+    np.testing.assert_array_equal(memory[:, 1:], observer.begin(3)[:, 1:])
+    np.testing.assert_array_equal(estimates[:, 6], -1.0)
