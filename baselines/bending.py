@@ -47,11 +47,12 @@ class BendingObserver:
 
     names = (
         *(f"model_error.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
+        *(f"uncertainty.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
         "own_tilt.roll",
         "own_tilt.pitch",
         "excess_load",
     )
-    """What `observe` returns: ρ [1], tilt [rad], measured over assumed load less one [1]."""
+    """What `observe` returns: ρ and its standard deviation [1], tilt [rad], measured over assumed load less one [1]."""
     width = len(names)
     memory_width = 1 + 2 + _ESTIMATE + _VARIANCES
 
@@ -89,7 +90,8 @@ class BendingObserver:
         x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
         upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
         excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0
-        estimates = np.hstack([x[..., 0].reshape(n, -1), rows[:, self._attitude] - lean, excess])
+        deviation = np.sqrt(P[..., 0, 0].reshape(n, -1))
+        estimates = np.hstack([x[..., 0].reshape(n, -1), deviation, rows[:, self._attitude] - lean, excess])
         return estimates, np.hstack([counted, lean, x.reshape(n, -1), upper])
 
     def disagreement(self, rows: Array) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 | name | what it is |
 |---|---|
-| a group of the observation, such as `clock` | as it is in the observation |
+| a group or a signal of the observation, such as `clock` or `clock.swing` | as it is in the observation |
 | `observation` | all of them |
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] less the planned ones |
@@ -61,7 +61,7 @@ class Features:
         self._sources = [_source(name, model, period_s) for name in names]
         self._acts = BASE_ACTION in settings.observe
         widths = [source.width for source in self._sources]
-        is_measured = np.repeat([name in _MEASUREMENTS for name in names], widths)
+        is_measured = np.repeat([name.split(".")[0] in _MEASUREMENTS for name in names], widths)
         self._measured, self._history = np.flatnonzero(is_measured), settings.history
         past = self._history * len(self._measured)
         self._ends = np.cumsum([past, *(source.memory_width for source in self._sources)])
@@ -113,7 +113,7 @@ def _named(observe: tuple[str, ...], model: RobotModel) -> list[str]:
 
 
 def _source(name: str, model: RobotModel, period_s: float) -> Source:
-    if name in _groups(model):
+    if name in _groups(model) or name in model.observation_table.names:
         group = model.observation_table.group(name)
         return _Instant(lambda rows: rows[:, group], len(model.observation_table))
     if name == "encoder_error":

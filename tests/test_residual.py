@@ -378,15 +378,18 @@ def test_residuals_see_what_they_are_told_to() -> None:
     """Catches another order, and a history of what is no measurement or of another group."""
     env: Any = vector("walker", 2)
     table, generator = env.unwrapped.assumed_model.observation_table, np.random.default_rng(0)
-    features = Features(around(env, "input_output", observe=("imu_rate", "clock", "bending"), history=2))
+    features = Features(
+        around(env, "input_output", observe=("imu_rate", "clock.swing", "load_share", "bending"), history=2)
+    )
     rates = np.arange(len(table))[table.group("imu_rate")]
     rows, memory, seen = generator.normal(size=(5, 2, len(table))), None, np.zeros((2, 0))
     for decision in range(5):
         fresh = np.array([decision in (0, 3), decision == 0])
         seen, memory = features.at(rows[decision], memory, fresh, None, None)
-    assert seen.shape == (2, features.width) == (2, 3 + 3 + len(BendingObserver.names) + 2 * 3)
+    assert seen.shape == (2, features.width) == (2, 3 + 2 + len(BendingObserver.names) + 2 * 3)
     np.testing.assert_array_equal(seen[:, :3], rows[4][:, rates])
-    np.testing.assert_array_equal(seen[:, 3:6], rows[4][:, table.group("clock")])
+    np.testing.assert_array_equal(seen[:, [3]], rows[4][:, table.group("clock.swing")])
+    np.testing.assert_array_equal(seen[:, [4]], rows[4][:, table.group("load_share")])
     np.testing.assert_array_equal(seen[1, -6:], np.concatenate([rows[3][1, rates], rows[2][1, rates]]))
     np.testing.assert_array_equal(seen[0, -6:], np.concatenate([rows[3][0, rates], rows[3][0, rates]]))
 
