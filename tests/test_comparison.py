@@ -483,7 +483,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
         patch.chdir(root)
         patch.setattr(train.compare, "run_conditions", run)
-        patch.setattr("train.cli._CONSOLE", Console(width=160, file=file))
+        patch.setattr("train.commands.playing.CONSOLE", Console(width=160, file=file))
         main(["compare", "two.yaml"])
     return root / "runs" / "two", (root / "printed.txt").read_text()
 

@@ -254,7 +254,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         console = Console(width=200, record=True, quiet=False, file=(root / "printed.txt").open("w"))
-        patch.setattr("train.cli._CONSOLE", console)
+        patch.setattr("train.commands.playing.CONSOLE", console)
         main(["compare", "small.yaml", "--jobs", "2"])
         console.file.close()
     return Compared(
@@ -705,8 +705,12 @@ def _write_and_fail(path: Path) -> None:
     raise ZeroDivisionError
 
 
-def test_interrupting_a_comparison_ends_its_workers_at_once(tmp_path: Path) -> None:
-    """Catches Ctrl-C that is ignored until all is done, and workers that go on without their parent."""
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_comparison_that_ends_takes_its_workers_with_it(tmp_path: Path, how: signal.Signals) -> None:
+    """Catches Ctrl-C that is ignored until all is done, and workers that go on without their parent.
+
+    SIGINT reaches the whole process group, as from a terminal; SIGKILL the parent alone.
+    """
     policies = [{"name": name, "label": f"{name} {n}"} for n in range(3) for name in ("zero", "input")]
     (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": policies}))
     process = subprocess.Popen(
@@ -717,15 +721,18 @@ def test_interrupting_a_comparison_ends_its_workers_at_once(tmp_path: Path) -> N
     while len(_members(process.pid)) < 4 and time.monotonic() < deadline:  # parent, manager, two workers
         time.sleep(0.2)
     time.sleep(2.0)
-    os.killpg(process.pid, signal.SIGINT)
-    output, _ = process.communicate(timeout=20)
-    assert process.returncode == 130, output
-    assert "Traceback" not in output
+    if how is signal.SIGINT:
+        os.killpg(process.pid, how)
+        output, _ = process.communicate(timeout=20)
+        assert process.returncode == 130, output
+        assert "Traceback" not in output
+    else:
+        process.kill()
     deadline = time.monotonic() + 10.0
     while _members(process.pid) and time.monotonic() < deadline:  # Python's own resource tracker leaves last
         time.sleep(0.1)
     assert _members(process.pid) == []
-    assert not (tmp_path / "runs" / "long").exists()
+    assert how is signal.SIGKILL or not (tmp_path / "runs" / "long").exists()
 
 
 def _members(group: int) -> list[int]:

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing.managers import SyncManager
@@ -58,10 +59,10 @@ def side_by_side(
     jobs = min(jobs or os.cpu_count() or 1, len(arguments))
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
-    manager.start(_ignore_interrupts)
+    manager.start(_follow_parent)
     with manager:
         reports = manager.Queue()
-        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts)
+        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_follow_parent)
         try:
             futures = [pool.submit(_call, function, given, n, reports) for n, given in enumerate(arguments)]
             while not all(future.done() for future in futures):
@@ -84,9 +85,21 @@ def progress_bar(console: Console, transient: bool = False) -> Progress:
     )  # fmt: skip
 
 
-def _ignore_interrupts() -> None:
-    """In a worker: Ctrl-C reaches the whole process group, but the parent decides what happens."""
+def _follow_parent() -> None:
+    """In a worker: the parent decides what happens.
+
+    Ctrl-C reaches the whole process group and is left to the parent; a parent that is killed takes its workers with
+    it, so that none of them goes on writing beside a run that was resumed.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _raise_first(futures: Sequence[Future[Any]]) -> None:

@@ -1,0 +1,160 @@
+"""`elastic hardware`: scan, check, run, emulate, prove."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from elastic_env.errors import ConfigurationError
+from train.commands.options import CONSOLE, OnHardware, motion
+
+
+@dataclass
+class Scan:
+    """List the servos at a port, with model and firmware; nothing moves."""
+
+    port: Annotated[str, tyro.conf.Positional]
+    """Port, such as /dev/ttyUSB0."""
+    baudrate: int | None = None
+    """Bits per second; default: the usual rates, one after the other."""
+
+    def run(self) -> None:
+        """Scan."""
+        from train.hardware import scan
+
+        if not scan(self.port, self.baudrate, CONSOLE):
+            sys.exit(1)
+
+
+@dataclass
+class Check:
+    """Look at port, servos and IMU before anything moves, and say what to do; exit code 1 where something is."""
+
+    port: Annotated[str, tyro.conf.Positional]
+    """Port, such as /dev/ttyUSB0."""
+    ids: list[int] = field(default_factory=lambda: [1])
+    """Ids of the servos."""
+    baudrate: int = 3_000_000
+    """Bits per second."""
+    imu_port: str | None = None
+    """Port of the IMU."""
+
+    def run(self) -> None:
+        """Check."""
+        from train.hardware import check
+
+        if not check(self.port, self.ids, self.baudrate, self.imu_port, CONSOLE):
+            sys.exit(1)
+
+
+@dataclass
+class Run:
+    """Play one episode on the real testbed, show it as it goes, and keep every step.
+
+    Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input --reference sine
+    """
+
+    policy: str = "uncompensated"
+    """Baseline, residual:PATH, or "module:function" for one's own."""
+    reference: str | None = None
+    """Motion, as in elastic evaluate; default hold."""
+    output: Path | None = None
+    """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if taken."""
+    on: OnHardware = field(default_factory=OnHardware)
+
+    def run(self) -> None:
+        """Play."""
+        from train.conditions import PolicySpec
+        from train.hardware import run
+
+        if not (arguments := self.on.arguments):
+            raise ConfigurationError("--port is needed; see: elastic hardware scan, elastic hardware emulate")
+        path = run(arguments, motion("hardware", self.reference), PolicySpec(name=self.policy), CONSOLE, self.output)
+        CONSOLE.print(f"wrote {path}", soft_wrap=True)
+
+
+@dataclass
+class Emulate:
+    """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without hardware.
+
+    Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware emulate --lost 0.01
+    """
+
+    ids: list[int] = field(default_factory=lambda: [1])
+    """Ids of the servos; the IMU is on the link of the first."""
+    model_number: int = 54024
+    """Type of the servos: 54024, 54025 or 2020."""
+    scenario: str = "nominal"
+    """Scenario of the joint and of the IMU, as in elastic identify."""
+    stiffness: float | None = None
+    """K of the joint [N·m/rad]; default the paper's 1001."""
+    lost: float = 0.0
+    """Share of replies that do not come."""
+    late: float = 0.0
+    """Share of replies that come 6 ms late."""
+    corrupted: float = 0.0
+    """Share of replies with a flipped bit."""
+    truncated: float = 0.0
+    """Share of replies that end too early."""
+    latency_ms: float = 1.0
+    """Latency timer of the emulated USB adapter."""
+    seed: int = 0
+    """Seed of noise and faults."""
+
+    def run(self) -> None:
+        """Emulate."""
+        from elastic_env.entry_points import configure_testbed
+        from elastic_env.hardware.emulator.config import EmulatorConfig
+        from elastic_env.hardware.emulator.faults import Faults
+        from train.hardware import emulate
+
+        faults = Faults(
+            lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
+            latency_s=1e-3 * self.latency_ms,
+        )  # fmt: skip
+        config = EmulatorConfig(
+            ids=tuple(self.ids), model_number=self.model_number, faults=faults, seed=self.seed,
+            testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
+        )  # fmt: skip
+        emulate(config, CONSOLE)
+
+
+@dataclass
+class Prove:
+    """Measure what driver, limits and supervisor do when things go wrong, against an emulated bus.
+
+    Long: about 25 minutes; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
+    """
+
+    share: float = 1.0
+    """Share of the repetitions and durations."""
+    only: list[str] = field(default_factory=list)
+    """Names of the measurements; default all."""
+    output: Path | None = None
+    """Folder for hardware.json, new or empty; default runs/prove, numbered if taken."""
+
+    def run(self) -> None:
+        """Measure."""
+        from train.prove_hardware import prove
+
+        if not prove(self.share, self.only, CONSOLE, self.output):
+            sys.exit(1)
+
+
+@dataclass
+class Hardware:
+    """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate, prove."""
+
+    command: (
+        Annotated[Scan, tyro.conf.subcommand("scan")]
+        | Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Run, tyro.conf.subcommand("run")]
+        | Annotated[Emulate, tyro.conf.subcommand("emulate")]
+        | Annotated[Prove, tyro.conf.subcommand("prove")]
+    )
+
+    def run(self) -> None:
+        """Do what was asked for."""
+        self.command.run()

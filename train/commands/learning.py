@@ -1,0 +1,91 @@
+"""Commands that make residuals: train, export."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from elastic_env.config import load_yaml
+from elastic_env.errors import ConfigurationError
+from train.commands.options import CONSOLE, options_named
+
+
+@dataclass
+class Train:
+    """Train a residual on top of a base policy, for every training seed of a configuration.
+
+    Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train --resume runs/NAME.
+    A run keeps, for every seed, checkpoint/ to go on from, best/ and last/ as policies, which elastic evaluate and
+    compare take as residual:PATH, progress.csv, and files for TensorBoard.
+    """
+
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """Configuration; those in configs/train_*.yaml are examples."""
+    resume: Path | None = None
+    """Folder of a run to go on with."""
+    seeds: list[int] | None = None
+    """Training seeds instead of the configuration's."""
+    decisions: int | None = None
+    """Decisions of all worlds together instead of the configuration's."""
+    output: Path | None = None
+    """Folder for the run, new or empty; default runs/<name>, numbered if taken."""
+    jobs: int = 1
+    """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
+
+    def run(self) -> None:
+        """Train, or go on with it."""
+        if self.jobs < 0:
+            raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {self.jobs}")
+        if (self.config is None) == (self.resume is None):
+            raise ConfigurationError("name either a configuration or, with --resume, the run to go on with")
+        given = {"seeds": self.seeds, "decisions": self.decisions}
+        changes = {name: value for name, value in given.items() if value is not None}
+        if self.resume is not None and (changes or self.output is not None):
+            raise ConfigurationError(
+                "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
+            )
+        try:
+            from train.run_training import resume, start
+            from train.train_config import TrainConfig
+        except ModuleNotFoundError as error:
+            raise ConfigurationError(
+                f"training needs {error.name}; install the extra: pip install 'elastic-env[train]'"
+            ) from None
+        if self.resume is not None:
+            folder = resume(self.resume, CONSOLE, self.jobs)
+        else:
+            config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
+            with options_named():
+                config = config.replace(**changes)
+            folder = start(config, CONSOLE, self.output, self.jobs)
+        CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
+
+
+@dataclass
+class Export:
+    """Turn a model that Stable-Baselines3 saved into a residual folder, which plays without torch and runs no code.
+
+    Example: elastic export model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl --trust-pickle
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """Zip of model.save()."""
+    config: Annotated[Path, tyro.conf.Positional]
+    """Configuration of its training: algorithm, base, settings."""
+    normaliser: Path | None = None
+    """File of VecNormalize.save(); leave it out where observations were not normalised."""
+    trust_pickle: bool = False
+    """SB3 keeps models as pickles: loading one runs code from it."""
+    output: Path | None = None
+    """Folder for the residual, new or empty; default runs/<name of the zip>, numbered if taken."""
+
+    def run(self) -> None:
+        """Export."""
+        from train.export import export_zip
+        from train.runs import free_folder
+        from train.train_config import TrainConfig
+
+        folder = free_folder(self.model.stem, self.output)
+        export_zip(self.model, load_yaml(self.config, TrainConfig), folder, self.normaliser, self.trust_pickle)
+        CONSOLE.print(f"play it as residual:{folder}", soft_wrap=True)

@@ -1,0 +1,94 @@
+"""What the commands of `elastic` share: console, options of hardware, and how options are read."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+
+from elastic_env.config import parse_yaml
+from elastic_env.errors import ConfigurationError
+
+CONSOLE = Console()
+"""Where the commands say what they do."""
+
+_PARAMETER = re.compile(r"^(?:(?:\w+Config|Condition)\.(\w+)|(reference)s?)(?:\.\d+)?(?=:| must be )", re.MULTILINE)
+
+
+@dataclass
+class OnHardware:
+    """Options of commands that run on the simulated testbed, or with --port on a real one."""
+
+    port: str | None = None
+    """Port of a real servo, such as /dev/ttyUSB0, in place of the simulation."""
+    imu_port: str | None = None
+    """Port of the IMU on its link."""
+    mounting: Path | None = None
+    """YAML file of signs, zeros, ids and limits of the real testbed, see docs/hardware.md."""
+    yes: bool = False
+    """Begin to move without asking."""
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the environment on hardware; empty for the simulation."""
+        if self.port is None and self.mounting is None and self.imu_port is None and not self.yes:
+            return {}
+        from train.hardware import hardware_arguments
+
+        return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
+
+
+def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed."""
+    if not arguments:
+        return {"env": env}
+    if env not in ("testbed", "hardware"):
+        raise ConfigurationError(f"--port is of the testbed, got the environment {env!r}")
+    return {"env": "hardware", "env_options": arguments}
+
+
+@contextmanager
+def options_named() -> Iterator[None]:
+    """Errors of a configuration that is made from options name the options in place of its parameters."""
+    try:
+        yield
+    except ConfigurationError as error:
+        named = _PARAMETER.sub(lambda found: "--" + (found[1] or found[2]).replace("_", "-"), str(error))
+        raise ConfigurationError(named) from None
+
+
+def motion(env: str, text: str | None) -> Any:
+    """A reference as it is written: a name, a number, durations or a mapping; the environment's default for None."""
+    from train.environments import environment
+
+    default = environment(env).default_reference
+    if text is None:
+        return default
+    try:
+        value = parse_yaml(text)
+    except yaml.YAMLError:
+        raise ConfigurationError(
+            f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "
+            "'{step_period: 3, num_steps: 2}'"
+        ) from None
+    return value if isinstance(value, int | float | list | dict) else text
+
+
+def stiffness_option(text: str) -> float | list[Any] | str:
+    """A stiffness as it is written: a number, a list of numbers, or else the path of a file."""
+    try:
+        value = parse_yaml(text)
+    except yaml.YAMLError:
+        return text
+    return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
+
+
+def print_files(comparison: Any) -> None:
+    """Say what a comparison wrote."""
+    CONSOLE.print(f"Results in {comparison.folder}:", soft_wrap=True)
+    for path in comparison.files:
+        CONSOLE.print(f"  {path}", soft_wrap=True)

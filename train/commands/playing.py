@@ -1,0 +1,191 @@
+"""Commands that play policies: identify, evaluate, compare, play, demo."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from elastic_env.config import load_yaml
+from train.commands.options import CONSOLE, OnHardware, motion, options_named, place, print_files, stiffness_option
+
+
+@dataclass
+class Identify:
+    """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
+
+    Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and separates stiffness,
+    friction, dead band and offset. Writes identification.json, which the environment and the compensators take as their
+    K, and a figure. Example: elastic identify --scenario backlash
+
+    On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
+    """
+
+    scenario: str = "nominal"
+    """Scenario of the simulated testbed, such as nominal, ideal, backlash, ideal+soft."""
+    stiffness: float | None = None
+    """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
+    second_mass: float | None = None
+    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q from K; such as 0.5."""
+    positions: int = 20
+    """Number of static positions."""
+    seed: int = 0
+    """Seed of the sensor noise."""
+    repeats: int = 1
+    """Repeat with so many seeds and say how often the interval holds the true stiffness."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/identify, numbered if taken."""
+    on: OnHardware = field(default_factory=OnHardware)
+
+    def run(self) -> None:
+        """Identify, write, print."""
+        from train.identify import IdentifyConfig, run_identification
+
+        with options_named():
+            given = {name: value for name, value in vars(self).items() if name not in ("output", "on")}
+            config = IdentifyConfig(**given, hardware=self.on.arguments)
+        run_identification(config, CONSOLE, self.output)
+
+
+@dataclass
+class Evaluate:
+    """Play episodes of one policy under one scenario and print its metrics.
+
+    Example, one joint: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
+
+    Example, a walk: elastic evaluate --env walker --policy input_wrench --reference 3
+    """
+
+    policy: str = "input"
+    """Baseline, or "module:function" for one's own. Baselines are
+    zero, uncompensated, input, dynamic, oracle; on the walker also
+    uncompensated_open, input_open, input_output, input_wrench."""
+    env: str = "testbed"
+    """Environment: testbed (one joint; with --port a real one) or walker (a humanoid that walks in place)."""
+    scenario: str = "nominal"
+    """Scenario, such as nominal, ideal, soft, stiff, payload, backlash,
+    sensor, ideal+soft; on the walker also spread, push, slope."""
+    reference: str | None = None
+    """Motion. Testbed: hold (default), sine, multisine, steps,
+    or a mapping such as '{kind: sine, amplitude: 0.3}'.
+    Walker: step period 24, 3 (default), 1.6 or 1.1 [s],
+    or its durations of double, single, double support '[0.8, 0.6, 0.8]',
+    or a mapping such as '{step_period: 3, num_steps: 2}'."""
+    episodes: int = 1
+    """Number of episodes, seeds following --seed."""
+    seed: int = 0
+    """Seed of the first episode."""
+    stiffness: str | None = None
+    """K that the policy assumes: a number [N·m/rad], a list of one per joint
+    such as '[1001]', twelve on the walker, or the path of an identification.json."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
+    on: OnHardware = field(default_factory=OnHardware)
+
+    def run(self) -> None:
+        """Evaluate as a comparison of one cell."""
+        from train.compare import CompareConfig, compare
+        from train.conditions import PolicySpec
+
+        options = {} if self.stiffness is None else {"stiffness": stiffness_option(self.stiffness)}
+        arguments = self.on.arguments
+        with options_named():
+            config = CompareConfig(
+                name="evaluate", references=[motion(self.env, self.reference)], **place(self.env, arguments),
+                scenarios=["hardware" if arguments else self.scenario],
+                policies=[PolicySpec(name=self.policy, options=options)],
+                episodes=self.episodes, seed=self.seed,
+            )  # fmt: skip
+        print_files(compare(config, CONSOLE, self.output, report=False))
+
+
+@dataclass
+class Compare:
+    """Compare policies × scenarios × references × seeds as a configuration says.
+
+    Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts and tables, works
+    offline), report.md, summary.md and figures beside the resolved configuration, seed, versions and commit.
+
+    A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all training seeds of a
+    residual, compared with their base on the same episodes, with intervals over training seeds. The base is added if
+    it is not among the policies.
+
+    Example, one joint: elastic compare configs/testbed.yaml
+
+    Example, the paper's walks: elastic compare configs/paper.yaml
+
+    Example, trained residuals: elastic compare configs/learned_testbed.yaml
+    """
+
+    config: Annotated[Path, tyro.conf.Positional]
+    """YAML configuration, see configs/."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
+    jobs: int = 0
+    """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
+    on: OnHardware = field(default_factory=OnHardware)
+
+    def run(self) -> None:
+        """Compare."""
+        from train.compare import CompareConfig, compare
+
+        config, arguments = load_yaml(self.config, CompareConfig), self.on.arguments
+        if arguments:
+            real = place(config.env, arguments)
+            real["env_options"] = {**config.env_options, **real["env_options"]}
+            config = config.replace(scenarios=["hardware"], scenario_episodes={}, **real)
+        print_files(compare(config, CONSOLE, self.output, self.jobs))
+
+
+@dataclass
+class Play:
+    """Watch one episode: in a window in real time, or with --video as a file.
+
+    Deviations from the reference are drawn enlarged, by a factor that the picture shows.
+
+    Example, one joint: elastic play --policy input --reference sine --video sine.mp4
+
+    Example, a walk: elastic play --env walker --policy input_output --video walk.mp4
+    """
+
+    policy: str = "uncompensated"
+    """Baseline, or "module:function" for one's own; see elastic evaluate --help."""
+    env: str = "testbed"
+    """Environment: testbed or walker."""
+    scenario: str = "nominal"
+    """Scenario."""
+    reference: str | None = None
+    """Motion, as in elastic evaluate; default sine, on the walker 3."""
+    seed: int = 0
+    """Seed of the episode."""
+    video: Path | None = None
+    """Video file to write (.mp4, .gif); without it a window opens."""
+    max_s: float | None = None
+    """Stop after this much simulated time [s]."""
+
+    def run(self) -> None:
+        """Play."""
+        from train.conditions import Condition, PolicySpec
+        from train.play import play
+
+        reference = "sine" if self.reference is None and self.env == "testbed" else self.reference
+        with options_named():
+            condition = Condition(
+                env=self.env, policy=PolicySpec(name=self.policy), reference=motion(self.env, reference),
+                scenario=self.scenario, seed=self.seed,
+            )  # fmt: skip
+        play(condition, CONSOLE, self.video, self.max_s)
+
+
+@dataclass
+class Demo:
+    """The paper's experiments in short, on testbed and walker, in under two minutes, with pictures."""
+
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/demo, numbered if taken."""
+
+    def run(self) -> None:
+        """Run the demonstration."""
+        from train.demo import demo
+
+        demo(CONSOLE, self.output)
