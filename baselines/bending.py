@@ -85,7 +85,7 @@ class BendingObserver:
         counted = counted + 1.0
         gain = np.maximum(1.0 / counted, self._least_gain)
         lean = lean + gain * np.where(loaded.any(axis=1, keepdims=True), _lean(force) - lean, 0.0)
-        seen, expected = self.disagreement(rows)
+        seen, expected = self.disagreement(rows, self.bending(rows))
         x, P = estimate.reshape(n, *_FILTERS, _UNKNOWNS), _symmetric(variances.reshape(n, *_FILTERS, 3))
         x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
         upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
@@ -94,17 +94,33 @@ class BendingObserver:
         estimates = np.hstack([x[..., 0].reshape(n, -1), deviation, rows[:, self._attitude] - lean, excess])
         return estimates, np.hstack([counted, lean, x.reshape(n, -1), upper])
 
-    def disagreement(self, rows: Array) -> tuple[Array, Array]:
+    def bending(self, rows: Array) -> Array:
+        """Expected bending of the joints under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
+        theta = rows[:, self._theta]
+        return theta - self._compensator.at(rows).link_angle(theta, theta)
+
+    def link_angles(self, rows: Array, estimates: Array) -> Array:
+        """Link angles by the expected bending and its estimated error in roll, (num_worlds, 12) [rad].
+
+        That in pitch is left out: friction hides more than it shows.
+        """
+        legs = rows[:, self._theta].reshape(len(rows), 2, -1)
+        bending = self.bending(rows).reshape(legs.shape)
+        about_x = np.array(self._model.biped.chains.axis) == 0
+        q = legs - (1.0 + about_x * estimates[:, [0, 2], None]) * bending
+        return q.reshape(len(rows), -1)
+
+    def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
         """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a foot that is flat.
 
         Args:
             rows: Observations, (num_worlds, m).
+            bending: Of the joints, (num_worlds, 12) [rad].
 
         Returns:
             (num_worlds, 2 legs, 2) each, roll and pitch [rad].
         """
         theta, attitude = rows[:, self._theta], rows[:, self._attitude]
-        bending = theta - self._compensator.at(rows).link_angle(theta, theta)
         bent = bending.reshape(len(rows), 2, -1).transpose(2, 0, 1)
         chains = self._model.biped.chains
         posture = chains.posture(theta.reshape(len(rows), 2, -1))
