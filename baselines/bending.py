@@ -99,17 +99,6 @@ class BendingObserver:
         theta = rows[:, self._theta]
         return theta - self._compensator.at(rows).link_angle(theta, theta)
 
-    def link_angles(self, rows: Array, estimates: Array) -> Array:
-        """Link angles by the expected bending and its estimated error in roll, (num_worlds, 12) [rad].
-
-        That in pitch is left out: friction hides more than it shows.
-        """
-        legs = rows[:, self._theta].reshape(len(rows), 2, -1)
-        bending = self.bending(rows).reshape(legs.shape)
-        about_x = np.array(self._model.biped.chains.axis) == 0
-        q = legs - (1.0 + about_x * estimates[:, [0, 2], None]) * bending
-        return q.reshape(len(rows), -1)
-
     def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
         """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a foot that is flat.
 

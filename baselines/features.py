@@ -5,8 +5,8 @@
 | a group or a signal of the observation, such as `clock` or `clock.swing` | as it is in the observation |
 | `observation` | all of them |
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
+| `contact_error` | walker: measured ZMP [m] and load share [1] less the planned ones |
 | `bending` | walker: how much more the joints bend than the model says, own tilt, load (`baselines.bending`) |
-| `odometry` | walker: how far its feet are from their footholds; measured ZMP and load share less the planned ones |
 | `base_action` | what the base alone would command now [rad] |
 """
 
@@ -17,10 +17,11 @@ import numpy as np
 
 from baselines.bending import BendingObserver
 from baselines.correction import Corrected
-from baselines.odometry import LegOdometry
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
+from elastic_env.robots.thormang import SIDES
 from elastic_env.signals import Array, BoolArray
+from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 
 OBSERVATION, BASE_ACTION = "observation", "base_action"
 _MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "wrench", "link_angle_imu")
@@ -117,11 +118,12 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
         return _Instant(lambda rows: rows[:, group], len(model.observation_table))
     if name == "encoder_error":
         return _encoder_error(model)
-    of_walker = {"bending": BendingObserver, "odometry": LegOdometry} if isinstance(model, WalkerModel) else {}
-    if isinstance(model, WalkerModel) and name in of_walker:
-        return of_walker[name](model, period_s)
-    known = [OBSERVATION, BASE_ACTION, "encoder_error", *of_walker, *_groups(model)]
-    raise unknown_name("feature of a residual", name, known)
+    if isinstance(model, WalkerModel) and name == "contact_error":
+        return _Instant(_ContactError(model), len(model.observation_table))
+    if isinstance(model, WalkerModel) and name == "bending":
+        return BendingObserver(model, period_s)
+    further = ["encoder_error", *(["contact_error", "bending"] if isinstance(model, WalkerModel) else [])]
+    raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
 
 
 class _Instant:
@@ -143,3 +145,28 @@ class _Instant:
 def _encoder_error(model: RobotModel) -> _Instant:
     encoder, reference = (model.observation_table.group(name) for name in ("encoder_angle", "reference_angle"))
     return _Instant(lambda rows: rows[:, encoder] - rows[:, reference], len(model.observation_table))
+
+
+class _ContactError:
+    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less the planned ones.
+
+    Zero where the feet carry too little for a ZMP.
+    """
+
+    _LEAST_N = 50.0
+
+    def __init__(self, model: WalkerModel) -> None:
+        table, biped = model.observation_table, model.biped
+        self._wrench, self._share, self._zmp = (table.group(n) for n in ("wrench", "load_share", "zmp_reference"))
+        rigid = biped.rigid
+        feet = [rigid.body(f"{side}_foot").id for side in SIDES]
+        self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
+        self._ankles = biped.ankles
+
+    def __call__(self, rows: Array) -> Array:
+        wrench = rows[:, self._wrench].reshape(-1, 2, 2, 3)
+        force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
+        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
+        vertical = force[:, :, 2].sum(axis=1)
+        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan) - rows[:, self._share][:, 0]
+        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0)
