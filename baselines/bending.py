@@ -10,9 +10,6 @@ The model and the measured foot wrenches say how much bending to expect, s = Σ 
 ρ of that leg's model, e = (1 + ρ) s + c. Bending comes and goes with the load and c does not, so that recursive least
 squares over the time that a foot is loaded tell ρ from c, for roll and pitch of each leg [Kalman1960, without drift].
 
-The ground's mean force leans by as much as the ground is tilted, whatever bends. The attitude less that lean is a tilt
-that the robot made itself.
-
 [Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic Eng. 82.
 """
 
@@ -35,34 +32,29 @@ _ESTIMATE, _VARIANCES = 8, 12  # per world: (legs, axes, unknowns) and (legs, ax
 
 
 class BendingObserver:
-    """Estimates of the model's error and of the robot's own tilt, from the observations of a walker.
+    """Estimates of the model's error, from the observations of a walker.
 
-    Memory per world: measurements so far, mean lean of the ground's force, estimates, their covariance.
+    Memory per world: estimates of ρ and c, and their covariance.
 
     Args:
         model: Assumed walker.
-        period_s: Time between measurements [s].
-        mean_s: Time constant of the mean lean, after as much time [s].
     """
 
     names = (
         *(f"model_error.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
         *(f"uncertainty.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
-        "own_tilt.roll",
-        "own_tilt.pitch",
         "excess_load",
     )
-    """What `observe` returns: ρ and its standard deviation [1], tilt [rad], measured over assumed load less one [1]."""
+    """What `observe` returns: ρ and its standard deviation, and measured over assumed load less one [1]."""
     width = len(names)
-    memory_width = 1 + 2 + _ESTIMATE + _VARIANCES
+    memory_width = _ESTIMATE + _VARIANCES
 
-    def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
+    def __init__(self, model: WalkerModel) -> None:
         self._model, self._compensator = model, GravityCompensator(model, output="wrench")
         table = model.observation_table
         self._theta, self._attitude = table.group("encoder_angle"), table.group("imu_attitude")
         self._wrench = table.group("wrench")
         self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
-        self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
 
     def begin(self, num_worlds: int) -> Array:
         """Memory before the first measurement, (num_worlds, memory_width)."""
@@ -81,18 +73,14 @@ class BendingObserver:
         n = len(rows)
         force = rows[:, self._wrench].reshape(n, 2, 2, 3)[:, :, 0]
         loaded: BoolArray = np.asarray(force[..., 2] >= LOADED_SHARE * self._carried)
-        counted, lean, estimate, variances = np.split(memory, np.cumsum([1, 2, _ESTIMATE]), axis=1)
-        counted = counted + 1.0
-        gain = np.maximum(1.0 / counted, self._least_gain)
-        lean = lean + gain * np.where(loaded.any(axis=1, keepdims=True), _lean(force) - lean, 0.0)
+        estimate, variances = np.split(memory, [_ESTIMATE], axis=1)
         seen, expected = self.disagreement(rows, self.bending(rows))
         x, P = estimate.reshape(n, *_FILTERS, _UNKNOWNS), _symmetric(variances.reshape(n, *_FILTERS, 3))
         x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
         upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
         excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0
         deviation = np.sqrt(P[..., 0, 0].reshape(n, -1))
-        estimates = np.hstack([x[..., 0].reshape(n, -1), deviation, rows[:, self._attitude] - lean, excess])
-        return estimates, np.hstack([counted, lean, x.reshape(n, -1), upper])
+        return np.hstack([x[..., 0].reshape(n, -1), deviation, excess]), np.hstack([x.reshape(n, -1), upper])
 
     def bending(self, rows: Array) -> Array:
         """Expected bending of the joints under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
@@ -122,13 +110,6 @@ class BendingObserver:
         R = (rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])).swapaxes(-1, -2)
         up, expected = np.stack(normal, axis=-1) @ R, np.stack(turn, axis=-1) @ R
         return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
-
-
-def _lean(force: Array) -> Array:
-    """Roll and pitch of ground whose force on level feet is this, (n, legs, 3) [N] to (n, 2) [rad]."""
-    x, y, z = force.sum(axis=1).T
-    z = np.maximum(z, 1.0)
-    return np.stack([y / z, -x / z], axis=1)
 
 
 def _symmetric(upper: Array) -> Array:

@@ -6,7 +6,8 @@
 | `observation` | all of them |
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] less the planned ones |
-| `bending` | walker: how much more the joints bend than the model says, own tilt, load (`baselines.bending`) |
+| `level` | walker: attitude and foot wrenches as on level ground (`baselines.ground_level`) |
+| `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.bending`) |
 | `base_action` | what the base alone would command now [rad] |
 """
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from baselines.bending import BendingObserver
 from baselines.correction import Corrected
+from baselines.ground_level import GroundLevel
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.robots.thormang import SIDES
@@ -120,9 +122,11 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
         return _encoder_error(model)
     if isinstance(model, WalkerModel) and name == "contact_error":
         return _Instant(_ContactError(model), len(model.observation_table))
+    if isinstance(model, WalkerModel) and name == "level":
+        return GroundLevel(model, period_s)
     if isinstance(model, WalkerModel) and name == "bending":
-        return BendingObserver(model, period_s)
-    further = ["encoder_error", *(["contact_error", "bending"] if isinstance(model, WalkerModel) else [])]
+        return BendingObserver(model)
+    further = ["encoder_error", *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
     raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
 
 
