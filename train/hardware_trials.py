@@ -197,7 +197,7 @@ def _enable(bus: SupervisedBus, limits: SafetyLimits) -> None:
 
 
 def _is_enabled_again(bus: SupervisedBus, limits: SafetyLimits, emulator: RunningEmulator) -> bool:
-    """Torque on again after a stop; not where joints have swung beyond the limits, so that a hand must set them back."""
+    """Torque on again after a stop; not where joints have swung beyond the limits and a hand must set them back."""
     with contextlib.suppress(HardwareError):
         _enable(bus, limits)
         emulator.events()
