@@ -85,10 +85,3 @@ def stiffness_option(text: str) -> float | list[Any] | str:
     except yaml.YAMLError:
         return text
     return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
-
-
-def print_files(comparison: Any) -> None:
-    """Say what a comparison wrote."""
-    CONSOLE.print(f"Results in {comparison.folder}:", soft_wrap=True)
-    for path in comparison.files:
-        CONSOLE.print(f"  {path}", soft_wrap=True)

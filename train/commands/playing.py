@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from elastic_env.config import load_yaml
-from train.commands.options import CONSOLE, OnHardware, motion, options_named, place, print_files, stiffness_option
+from train.commands.options import CONSOLE, OnHardware, motion, options_named, place, stiffness_option
 
 
 @dataclass
@@ -96,7 +96,7 @@ class Evaluate:
                 policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes, seed=self.seed,
             )  # fmt: skip
-        print_files(compare(config, CONSOLE, self.output, report=False))
+        _print_files(compare(config, CONSOLE, self.output, report=False))
 
 
 @dataclass
@@ -134,7 +134,7 @@ class Compare:
             real = place(config.env, arguments)
             real["env_options"] = {**config.env_options, **real["env_options"]}
             config = config.replace(scenarios=["hardware"], scenario_episodes={}, **real)
-        print_files(compare(config, CONSOLE, self.output, self.jobs))
+        _print_files(compare(config, CONSOLE, self.output, self.jobs))
 
 
 @dataclass
@@ -189,3 +189,10 @@ class Demo:
         from train.demo import demo
 
         demo(CONSOLE, self.output)
+
+
+def _print_files(comparison: Any) -> None:
+    """Say what a comparison wrote."""
+    CONSOLE.print(f"Results in {comparison.folder}:", soft_wrap=True)
+    for path in comparison.files:
+        CONSOLE.print(f"  {path}", soft_wrap=True)
