@@ -5,7 +5,7 @@
 | a group or a signal of the observation, such as `clock` or `clock.swing` | as it is in the observation |
 | `observation` | all of them |
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
-| `contact_error` | walker: measured ZMP [m] and load share [1] less the planned ones |
+| `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.bending`) |
 | `base_action` | what the base alone would command now [rad] |
@@ -121,7 +121,7 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
     if name == "encoder_error":
         return _encoder_error(model)
     if isinstance(model, WalkerModel) and name == "contact_error":
-        return _Instant(_ContactError(model), len(model.observation_table))
+        return _ContactError(model, period_s)
     if isinstance(model, WalkerModel) and name == "level":
         return GroundLevel(model, period_s)
     if isinstance(model, WalkerModel) and name == "bending":
@@ -154,23 +154,31 @@ def _encoder_error(model: RobotModel) -> _Instant:
 class _ContactError:
     """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less the planned ones.
 
-    Zero where the feet carry too little for a ZMP.
+    The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too little
+    for a ZMP.
     """
 
+    width = 3
     _LEAST_N = 50.0
 
-    def __init__(self, model: WalkerModel) -> None:
+    def __init__(self, model: WalkerModel, period_s: float) -> None:
         table, biped = model.observation_table, model.biped
-        self._wrench, self._share, self._zmp = (table.group(n) for n in ("wrench", "load_share", "zmp_reference"))
+        self._level = GroundLevel(model, period_s)
+        self.memory_width = self._level.memory_width
+        self._share, self._zmp = table.group("load_share"), table.group("zmp_reference")
         rigid = biped.rigid
         feet = [rigid.body(f"{side}_foot").id for side in SIDES]
         self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
         self._ankles = biped.ankles
 
-    def __call__(self, rows: Array) -> Array:
-        wrench = rows[:, self._wrench].reshape(-1, 2, 2, 3)
+    def begin(self, num_worlds: int) -> Array:
+        return self._level.begin(num_worlds)
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        level, memory = self._level.observe(rows, memory)
+        wrench = level[:, 2:].reshape(-1, 2, 2, 3)
         force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
         zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
         vertical = force[:, :, 2].sum(axis=1)
         share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan) - rows[:, self._share][:, 0]
-        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0)
+        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0), memory

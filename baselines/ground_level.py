@@ -1,8 +1,17 @@
-"""What a walker's IMU and foot sensors would show if the ground were level.
+r"""What a walker's IMU and foot sensors would show if the ground were level.
 
-The force of the ground on a robot that walks in place is vertical in the mean. Seen from feet that lie flat it leans by
-as much as the ground is tilted, whatever the joints bend. The attitude less that lean is a tilt that the robot made
-itself, and the foot wrenches turned by it are those of level ground.
+Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is left of its
+direction when the acceleration of the center of mass c is taken off is the tilt of the ground λ, whatever the joints
+bend:
+
+.. math:: \lambda = \overline{f_{xy} / f_z - \ddot c_{xy} / g}
+
+where the mean of the acceleration over a time t is a difference of velocities, known from the motors to some σ_v, so
+that with σ_λ before any measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The attitude less this tilt is one
+that the robot made itself. The weight leans too, and acts at the center of mass, h over the ankles: set upright, it
+leaves the ankles with the wrenches of level ground,
+
+.. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
 """
 
 import numpy as np
@@ -14,16 +23,22 @@ from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
 LOADED_SHARE = 0.15
 """Share of the weight from which the feet count as loaded."""
 
+TILT_RAD, VELOCITY_M_PER_S = 0.01, 0.07
+"""σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well velocities are known."""
+
+_DIFFERENCE_S = 1e-3
+
 
 class GroundLevel:
     """Attitude and foot wrenches without the tilt of the ground, from the observations of a walker.
 
-    Memory per world: measurements so far, mean lean of the ground's force.
+    Memory per world: number of measurements in the mean, the mean, and the last velocity of the center of mass, nan
+    before the first.
 
     Args:
         model: Assumed walker.
         period_s: Time between measurements [s].
-        mean_s: Time constant of the mean lean, after as much time [s].
+        mean_s: Time constant of the mean, after as much time [s].
     """
 
     names = (
@@ -33,17 +48,22 @@ class GroundLevel:
     )
     """What `observe` returns: [rad], [N] and [N·m], the wrenches in the order of the observation."""
     width = len(names)
-    memory_width = 1 + 2
+    memory_width = 1 + 2 + 2
 
     def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
         table = model.observation_table
         self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
+        self._theta, self._rate = table.group("encoder_angle"), table.group("encoder_rate")
+        self._carried = model.biped.chains_above_feet
         self._least_n = LOADED_SHARE * model.biped.weight
+        self._period_s, self._gravity = period_s, model.biped.gravity
         self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
 
     def begin(self, num_worlds: int) -> Array:
         """Memory before the first measurement, (num_worlds, memory_width)."""
-        return np.zeros((num_worlds, self.memory_width))
+        memory = np.zeros((num_worlds, self.memory_width))
+        memory[:, 3:] = np.nan
+        return memory
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
         """Values after a measurement, see `names`, and the new memory.
@@ -53,14 +73,42 @@ class GroundLevel:
             memory: (num_worlds, memory_width).
         """
         n = len(rows)
-        wrench = rows[:, self._wrench].reshape(n, 4, 3)  # force and moment of the left foot, of the right one
-        x, y, z = (wrench[:, 0] + wrench[:, 2]).T
-        loaded = z >= self._least_n
-        z = np.where(loaded, z, np.inf)
-        counted = memory[:, 0] + loaded
-        gain = loaded * np.maximum(1.0 / np.maximum(counted, 1.0), self._least_gain)
-        lean = memory[:, 1:] + gain[:, None] * (np.stack([y / z, -x / z], axis=1) - memory[:, 1:])
+        wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
+        force, moment = wrench[:, :, 0], wrench[:, :, 1]
+        over_ankles, velocity = self._center_of_mass(rows, force[..., 2])
+        mean, number = self._mean(force.sum(axis=1), velocity, memory)
+        lean = mean * self._certainty(number)[:, None]
         R = rotation_y(lean[:, 1]) @ rotation_x(lean[:, 0])
-        leveled = wrench @ R.swapaxes(-1, -2)
-        values = np.hstack([rows[:, self._attitude] - lean, leveled.reshape(n, -1)])
-        return values, np.column_stack([counted, lean])
+        upright = force @ R.swapaxes(-1, -2)
+        added = over_ankles * (upright - force)[..., :2]
+        turned = moment + np.stack([-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1)
+        level = np.stack([upright, turned], axis=2).reshape(n, -1)
+        return np.hstack([rows[:, self._attitude] - lean, level]), np.column_stack([number, mean, velocity])
+
+    def _certainty(self, number: Array) -> Array:
+        """How much of the mean the estimate is, 0 to 1."""
+        change = self._gravity * TILT_RAD * self._period_s * number
+        return change**2 / (change**2 + VELOCITY_M_PER_S**2)
+
+    def _mean(self, force: Array, velocity: Array, memory: Array) -> tuple[Array, Array]:
+        """The mean after a measurement, about x and y [rad], and of how many it is."""
+        number, mean, before = memory[:, 0], memory[:, 1:3], memory[:, 3:]
+        is_known = (force[:, 2] >= self._least_n) & np.isfinite(before).all(axis=1)
+        accelerated = (velocity - before) / (self._period_s * self._gravity)
+        direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
+        seen = direction - np.where(is_known[:, None], accelerated, 0.0)
+        number = number + is_known
+        gain = is_known * np.maximum(1.0 / np.maximum(number, 1.0), self._least_gain)
+        return mean + gain[:, None] * (np.stack([seen[:, 1], -seen[:, 0]], axis=1) - mean), number
+
+    def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
+        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded one, (n, 2)."""
+        n = len(rows)
+        theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
+        now, soon = (self._from_ankles(angles) for angles in (theta, theta + _DIFFERENCE_S * rate))
+        velocity = (soon - now)[..., :2] / _DIFFERENCE_S
+        return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]
+
+    def _from_ankles(self, theta: Array) -> Array:
+        com, ankles = self._carried.com_and_feet(theta)
+        return com[:, None] - ankles
