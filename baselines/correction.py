@@ -1,7 +1,8 @@
 """A base policy corrected by a residual: what the residual acts on, and how fast it can change.
 
-The residual is a number in [−1, 1] for every corrected joint, decided once in `decision_period` control steps and
-passed through a first-order low-pass, by what `baselines.features` says. It acts in one of two spaces:
+The residual is a number in [−1, 1] for every corrected joint, or for every pair of them, decided from the features of
+`baselines.features` once in `decision_period` control steps and passed through a first-order low-pass. It acts in one
+of two spaces:
 
 * `joint`: an offset of the command in rad, added to what the base commands;
 * `model`: a relative change r of the deflection K⁻¹τ that the base compensates, (1 + r) δ, in the command and in the

@@ -141,8 +141,6 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     """
     if name.startswith(RESIDUAL):
         return _residual(Path(name.removeprefix(RESIDUAL)), env, options)
-    if name not in policy_names():
-        raise unknown_name("policy", name, [*policy_names(), f"{RESIDUAL}PATH"])
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
@@ -152,7 +150,7 @@ def make(name: str, env: Any, **options: Any) -> Policy:
     chosen = PolicyOptions(**given)
     known = _ON_THE_WALKER if isinstance(env.unwrapped.assumed_model, WalkerModel) else _ON_THE_TESTBED
     if name not in known:
-        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, known)
+        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, [*known, f"{RESIDUAL}PATH"])
     build, usable = known[name]
     _require_effect(name, env, given, usable)
     return build(env, _assumed(env, chosen), chosen)

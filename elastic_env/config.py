@@ -133,6 +133,8 @@ def _explain_one(model: type[BaseModel], problem: Mapping[str, Any]) -> str:
     if problem["type"] == "value_error":
         message = str(problem["ctx"]["error"])
         return f"{name}: {message}" if name else message
+    if problem["type"] == "model_type":
+        return f"{model.__name__}.{name} must be a mapping of parameters, got {problem['input']!r}"
     if problem["type"] == "too_short":
         return f"{model.__name__}.{name} needs at least {problem['ctx']['min_length']} entry, got {problem['input']!r}"
     requirement = _bounds(model, name) or problem["msg"].removeprefix("Input should be ")
@@ -177,13 +179,20 @@ def parse_yaml(text: str) -> Any:
     return yaml.load(text, _Loader)
 
 
-def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
+def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] | None = None) -> ModelT:
     """Read a YAML file into a validated model.
+
+    Args:
+        path: The file.
+        model: What it becomes.
+        changes: Parameters in place of the file's, or beside them.
 
     Raises:
         ConfigurationError: The file is missing, is not a YAML mapping, or does not fit the model.
     """
     file = Path(path)
+    if file.is_dir():
+        raise ConfigurationError(f"{file} is a folder, a YAML file is needed")
     if not file.is_file():
         known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
         listing = f"; found beside it: {', '.join(known)}" if known else ""
@@ -193,11 +202,12 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{file} must hold a mapping of parameters, got {type(content).__name__}")
+        got = "an empty file" if content is None else type(content).__name__
+        raise ConfigurationError(f"{file} must hold a mapping of parameters, such as 'name: value', got {got}")
     try:
         for key in content:
             if not isinstance(key, str):
                 raise unknown_name(f"parameter of {model.__name__}", key, model.model_fields)
-        return model(**content)
+        return model(**{**content, **(changes or {})})
     except ConfigurationError as error:
         raise ConfigurationError(f"in {file}: {error}") from None

@@ -50,7 +50,7 @@ class Outer(Model):
             {"rate": 1.0, "inner": {"lenght": 1.0}},
             r"unknown parameter of Inner 'lenght'; choose one of: length.*'length'",
         ),
-        ({"rate": 1.0, "inner": 5}, r"Outer\.inner must be .*Inner.*, got 5"),
+        ({"rate": 1.0, "inner": 5}, r"Outer\.inner must be a mapping of parameters, got 5"),
     ],
 )
 def test_a_wrong_value_names_parameter_unit_bound_and_itself(values: dict[str, object], message: str) -> None:
@@ -168,8 +168,8 @@ def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", r"outer\.yaml must hold a mapping of parameters, got NoneType"),
-        ("- 1\n- 2\n", r"outer\.yaml must hold a mapping of parameters, got list"),
+        ("", r"outer\.yaml must hold a mapping of parameters, .* got an empty file"),
+        ("- 1\n- 2\n", r"outer\.yaml must hold a mapping of parameters, .* got list"),
         ("rate: [1, 2\n", r"outer\.yaml is not valid YAML"),
         ("rate: 1\n  count: 2\n", r"outer\.yaml is not valid YAML"),
         ("rate: !!python/object/apply:os.getcwd []\n", r"outer\.yaml is not valid YAML"),
@@ -209,7 +209,7 @@ def test_a_missing_file_lists_those_beside_it(tmp_path: Path) -> None:
         load_yaml(tmp_path / "cmpare.yaml", Outer)
     with pytest.raises(ConfigurationError, match="no configuration file at"):
         load_yaml(tmp_path / "no" / "such.yaml", Outer)
-    with pytest.raises(ConfigurationError, match="no configuration file at"):
+    with pytest.raises(ConfigurationError, match="is a folder"):
         load_yaml(tmp_path, Outer)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from elastic_env.errors import ConfigurationError
+from elastic_env.hardware.attitude import AttitudeStream
 from elastic_env.hardware.bus import Bus, Buses, States
 from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.emulator.config import EmulatorConfig
@@ -34,14 +35,14 @@ def states(position: list[float], velocity: float = 0.0, current: float = 0.0, f
 
 def test_first_commands_lead_away_from_where_the_servo_stands_no_faster_than_allowed() -> None:
     """Catches the jump to the first goal, and a limit that holds for one step but not for the next."""
-    guard = Guard(SafetyLimits(slew_rad_s=1.0), np.array([0.2]))
+    guard = Guard(SafetyLimits(slew_rad_s=1.0), np.array([0.2]), ["it"])
     at = [float(guard.command(np.array([1.0]), 0.004)[0][0]) for _ in range(3)]
     np.testing.assert_allclose(at, [0.204, 0.208, 0.212])
 
 
 def test_goals_stay_within_the_position_limits() -> None:
     """Catches limits that only one side has, or that the slew limit undoes."""
-    guard = Guard(SafetyLimits(lowest_rad=-0.1, highest_rad=0.3, slew_rad_s=1000.0), np.zeros(2))
+    guard = Guard(SafetyLimits(lowest_rad=-0.1, highest_rad=0.3, slew_rad_s=1000.0), np.zeros(2), ["one", "two"])
     goals, is_limited = guard.command(np.array([-5.0, 5.0]), 0.004)
     assert goals.tolist() == [-0.1, 0.3]
     assert is_limited.all()
@@ -51,18 +52,18 @@ def test_goals_stay_within_the_position_limits() -> None:
 def test_goals_that_are_no_angles_stop_the_motion(goals: list[float]) -> None:
     """Catches a NaN that becomes some count on the wire."""
     with pytest.raises(FaultError, match="finite"):
-        Guard(SafetyLimits(), np.zeros(1)).command(np.array(goals), 0.004)
+        Guard(SafetyLimits(), np.zeros(1), ["it"]).command(np.array(goals), 0.004)
 
 
 def test_motion_does_not_begin_outside_the_limits() -> None:
     """Catches a first command that would drag the servo through the limit."""
     with pytest.raises(FaultError, match="by hand"):
-        Guard(SafetyLimits(lowest_rad=-0.5), np.array([-0.6]))
+        Guard(SafetyLimits(lowest_rad=-0.5), np.array([-0.6]), ["it"])
 
 
 def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> None:
     """Catches commands that go on blindly, a fault at the first hiccup, and a count that a good reply does not end."""
-    guard = Guard(SafetyLimits(slew_rad_s=1.0), np.zeros(1))
+    guard = Guard(SafetyLimits(slew_rad_s=1.0), np.zeros(1), ["it"])
     guard.command(np.array([1.0]), 0.004)
     assert guard.take(states([0.0], fresh=False)) == ""
     held, is_limited = guard.command(np.array([1.0]), 0.004)
@@ -71,7 +72,9 @@ def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> N
     assert guard.take(states([0.0], fresh=False)) == ""
     assert guard.take(states([0.0])) == ""
     assert guard.command(np.array([1.0]), 0.004)[0].tolist() == [0.008]
-    assert [guard.take(states([0.0], fresh=False)) != "" for _ in range(3)] == [False, False, True]
+    reasons = [guard.take(states([0.0], fresh=False)) for _ in range(3)]
+    assert reasons[:2] == ["", ""]
+    assert "no usable reply from it in 3 cycles" in reasons[2]
 
 
 @pytest.mark.parametrize(
@@ -84,12 +87,12 @@ def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> N
 )
 def test_what_is_measured_stops_the_motion(measured: States, words: str) -> None:
     """Catches a limit that is never looked at."""
-    assert words in Guard(SafetyLimits(), np.zeros(1)).take(measured)
+    assert words in Guard(SafetyLimits(), np.zeros(1), ["it"]).take(measured)
 
 
 def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
     """Catches a stop at one spike of the current, and none under a load that stays."""
-    guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1))
+    guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
     strained = states([0.0], current=-12.0)
     assert [guard.take(s) != "" for s in (strained, strained, states([0.0]), strained, strained, strained)] == [
         False, False, False, False, False, True,
@@ -183,6 +186,18 @@ def test_second_program_is_told_which_port_is_taken(emulator: RunningEmulator, s
         with pytest.raises(PortError, match=emulator.port):
             intrude()
     assert supervised.read().is_fresh.all()
+
+
+def test_a_program_that_takes_the_port_for_an_imus_does_not_disturb_the_motion(
+    emulator: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches a port that is opened, and its input thrown away, before anybody has asked whether it is free."""
+    start = supervised.enable(PATIENT)
+    cycle(supervised, start.tolist(), 5)
+    for _ in range(5):
+        with pytest.raises(PortError, match=f"another program uses {emulator.port}"):
+            AttitudeStream(emulator.port)
+        cycle(supervised, start.tolist(), 5)
 
 
 def test_servos_follow_and_torque_goes_off_at_the_end(emulator: RunningEmulator) -> None:

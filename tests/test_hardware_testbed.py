@@ -2,6 +2,9 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +20,7 @@ from elastic_env.errors import ConfigurationError
 from elastic_env.hardware.attitude import Attitude, AttitudeError, AttitudeStream, link_angle
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
-from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.errors import HardwareError, PortError
 from elastic_env.hardware.settings import HardwareSettings
 from train.cli import main
 from train.hardware import hardware_arguments
@@ -135,7 +138,7 @@ def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: Runni
             time.sleep(0.01)
             rolls.append(stream.latest().roll)
     assert np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01  # offset and noise of the scenario
-    with pytest.raises(AttitudeError, match="/dev/ttyNOTHING"):
+    with pytest.raises(PortError, match="/dev/ttyNOTHING: there is no such device"):
         AttitudeStream("/dev/ttyNOTHING")
 
 
@@ -171,13 +174,64 @@ def test_commands_run_on_hardware(
     rows = list(csv.DictReader(Path("run/log.csv").read_text().splitlines()))
     assert len(rows) == 425
     assert all(float(row["period"]) > 0.0 for row in rows)
-    main(["hardware", "scan", emulator.port, "--baudrate", "3000000"])
-    assert "H54-200-S500-R" in capsys.readouterr().out
+    assert json.loads(Path("run/metrics.json").read_text())["limited"] == max(int(row["limited"]) for row in rows)
+    capsys.readouterr()
+    main(["hardware", "scan", emulator.port])
+    assert capsys.readouterr().out.count("H54-200-S500-R") == 1  # at its own rate only
+
+
+def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
+    """Catches --port that is looked at after the file was refused for having none, and errors without a cure."""
+    mounting = tmp_path / "mounting.yaml"
+    mounting.write_text("direction: -1\n")
+    given = hardware_arguments("/dev/ttyUSB7", "/dev/ttyACM7", mounting, yes=False)
+    assert (given["port"], given["imu_port"], given["direction"]) == ("/dev/ttyUSB7", "/dev/ttyACM7", -1)
+    for text, port, words in (
+        ("direction: -1", None, "'port'"),
+        ("limits: 5", "p", "limits must be a mapping"),
+        ("limits: {torque_nm: 200}", "p", "<= 84"),
+        ("imu_port: p", "p", "port of their own"),
+        ("", "p", "an empty file"),
+    ):
+        mounting.write_text(text)
+        with pytest.raises(ConfigurationError, match=words):
+            hardware_arguments(port, None, mounting, yes=False)
+    with pytest.raises(ConfigurationError, match="is a folder"):
+        hardware_arguments("p", None, tmp_path, yes=False)
+
+
+def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
+    emulator: RunningEmulator, tmp_path: Path
+) -> None:
+    """Catches a log that is written at the end only, and Ctrl-C after which nobody knows what the servo does."""
+    mounting = tmp_path / "mounting.yaml"
+    mounting.write_text("approach_rad_s: 2.0\nlimits: {patience_cycles: 10, hang_s: 0.09}\n")
+    command = [
+        *(sys.executable, "-c", "from train.cli import main; main()", "hardware", "run", "--port", emulator.port),
+        *("--mounting", str(mounting), "--yes", "--reference", "sine", "--output", str(tmp_path / "run")),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        log = tmp_path / "run" / "log.csv"
+        deadline = time.monotonic() + 60.0
+        while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") > 250):
+            time.sleep(0.05)  # what is kept is seen on the disk while the run goes on
+        program.send_signal(signal.SIGINT)
+        said, complained = program.communicate(timeout=30)
+    rows = list(csv.DictReader(log.read_text().splitlines()))
+    assert len(rows) >= 250
+    assert f"cut short; the {len(rows)} steps until then are in {log}" in said
+    assert f"interrupted; torque at {emulator.port} is off" in complained
+    assert emulator.state()["torque_on"] == [False]
 
 
 def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches an identification without the link's angle, and options of hardware that are silently ignored."""
     for arguments, words in (
+        (["evaluate", "--port", "/dev/null", "--scenario", "soft"], "--scenario"),
+        (["identify", "--port", "/dev/null", "--imu-port", "p", "--scenario", "soft"], "--scenario"),
+        (["hardware", "check", "/dev/null", "--imu-port", "/dev/null"], "port of their own"),
+        (["hardware", "scan", "/dev/null"], "no serial port"),
+        (["hardware", "scan", "/tmp"], "a folder"),
         (["identify", "--port", "/dev/null"], "--imu-port"),
         (["identify", "--yes"], "--port"),
         (["evaluate", "--env", "walker", "--port", "/dev/null"], "testbed"),

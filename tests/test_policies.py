@@ -314,7 +314,7 @@ def test_unknown_policy_names_itself_and_the_choices() -> None:
     """Catches a KeyError, and a list that leaves a policy out."""
     with pytest.raises(ConfigurationError) as caught:
         baselines.make("inputt", scalar())
-    assert "unknown policy 'inputt'" in str(caught.value)
+    assert "unknown policy of the testbed 'inputt'" in str(caught.value)
     assert "Did you mean 'input'?" in str(caught.value)
     assert all(name in str(caught.value) for name in NAMES)
     assert set(baselines.policy_names()) >= set(NAMES)

@@ -43,6 +43,6 @@ def main(arguments: list[str] | None = None) -> None:
     except ElasticError as error:
         Console(stderr=True).print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted")
+    except KeyboardInterrupt as error:
+        Console(stderr=True).print("; ".join(["interrupted", *map(str, error.args)]), markup=False, soft_wrap=True)
         os._exit(130)  # worker processes must not keep the terminal waiting

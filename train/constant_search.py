@@ -27,9 +27,8 @@ _FALL_COST = 1e6
 class ConstantSearch(Trainer):
     """One training seed of a search, in a folder of its own.
 
-    All candidates of a generation play the same episodes, as many in every
-    scenario as the worlds allow, and are told the mean sum of rewards; who falls comes behind all who do not.
-    The policy is the mean of the distribution.
+    All candidates of a generation play the same episodes, as many in every scenario as the worlds allow, and are told
+    the mean sum of rewards; who falls comes behind all who do not. The policy is the mean of the distribution.
 
     Args:
         config: What is searched for; its algorithm_options may be population_size and sigma, in residuals.

@@ -3,8 +3,9 @@
 import contextlib
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import gymnasium
 import numpy as np
@@ -45,12 +46,13 @@ def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | 
     """
     if port is None and settings is None:
         if imu_port is not None or yes:
-            raise ConfigurationError("--imu-port and --yes are of hardware; it needs --port, or --mounting with a port")
+            option = "--yes" if imu_port is None else "--imu-port"
+            raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
         return {}
-    given = HardwareSettings(port=str(port)) if settings is None else load_yaml(settings, HardwareSettings)
-    changes = {"port": port, "imu_port": imu_port, "confirm": False if yes else None}
-    chosen = given.replace(**{name: value for name, value in changes.items() if value is not None})
-    return {name: getattr(chosen, name) for name in chosen.model_fields_set | changes.keys()} | {
+    options = {"port": port, "imu_port": imu_port, "confirm": False if yes else None}
+    given = {name: value for name, value in options.items() if value is not None}
+    chosen = HardwareSettings(**given) if settings is None else load_yaml(settings, HardwareSettings, given)
+    return {name: getattr(chosen, name) for name in chosen.model_fields_set | options.keys()} | {
         "limits": chosen.limits.model_dump()
     }
 
@@ -81,6 +83,7 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
 
 def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, console: Console) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
+    HardwareSettings(port=port, imu_port=imu_port)
     with Bus(port, baudrate) as bus:
         checks = check_bus(bus, ids)
     if imu_port is not None:
@@ -103,7 +106,7 @@ def run(
     console: Console,
     output: Path | None = None,
 ) -> Path:
-    """Play one episode on hardware, show it as it goes, and keep every step in log.csv.
+    """Play one episode on hardware, show it as it goes, and keep every step in log.csv, also of one that is cut short.
 
     Args:
         arguments: Of the environment.
@@ -113,41 +116,86 @@ def run(
         output: Folder for the results; default runs/hardware, numbered if taken.
 
     Returns:
-        The log.
+        Folder of log.csv and metrics.json.
     """
     env: Any = gymnasium.make(environment("hardware").id, disable_env_checker=True, reference=reference, **arguments)
     try:
         who = make_policy(policy, env)
         configuration = {"policy": policy.model_dump(mode="json"), "reference": reference, **arguments}
         with run_folder("hardware", configuration, None, output) as folder:
-            observation, _ = env.reset()
-            rows, state, start, period_s = [], None, np.array(True), env.unwrapped.task.config.control_period_s
-            while True:
-                action, state = who.predict(observation, state=state, episode_start=start, deterministic=True)
-                observation, _, _, truncated, info = env.step(action)
-                start = np.array(False)
-                rows.append({key: value for key, value in info.items() if not isinstance(value, dict)})
-                if len(rows) % round(_SHOWN_S / period_s) == 0:
-                    console.print(_line(rows[-1]))
-                if truncated:
-                    break
-            path = folder / "log.csv"
-            with path.open("w", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
-            (folder / "metrics.json").write_text(json.dumps(info["episode_metrics"], indent=2) + "\n")
-            return path
+            metrics: dict[str, Any] = {}
+            with _kept(folder / "log.csv", console) as log:
+                for info in _episode(env, who):
+                    log.take(info)
+                    metrics = info.get("episode_metrics", metrics)
+            (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+            return folder
     finally:
         env.close()
 
 
-def _line(info: dict[str, Any]) -> str:
-    return (
-        f"{info['time_s']:6.1f} s   q_ref {info['reference_angle']:+.4f}   link {info['link_angle']:+.4f} rad   "
-        f"torque {info['joint_torque']:+6.1f} N·m   jitter {1e3 * info['jitter']:+.2f} ms   "
-        f"overruns {info['overruns']}   missed {info['missed_replies']}"
+def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
+    """What every step of an episode tells."""
+    observation, _ = env.reset()
+    state, start, truncated = None, np.array(True), False
+    while not truncated:
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        observation, _, _, truncated, info = env.step(action)
+        start = np.array(False)
+        yield info
+
+
+class _Log:
+    """The rows of log.csv, and a line on the console once a second, up to which all rows are on the disk."""
+
+    _SHOWN = (
+        ("t", "s", "time_s", 1.0, "7.1f"),
+        ("q_ref", "rad", "reference_angle", 1.0, "+8.4f"),
+        ("link", "rad", "link_angle", 1.0, "+8.4f"),
+        ("torque", "N·m", "joint_torque", 1.0, "+8.1f"),
+        ("jitter", "ms", "jitter", 1e3, "+8.2f"),
+        ("overruns", "", "overruns", 1, "9d"),
+        ("missed", "", "missed_replies", 1, "7d"),
+        ("limited", "", "limited", 1, "8d"),
     )
+
+    def __init__(self, file: TextIO, console: Console) -> None:
+        self.num_rows = 0
+        self._file, self._console = file, console
+        self._writer: csv.DictWriter[str] | None = None
+        self._next_s = _SHOWN_S
+
+    def take(self, info: dict[str, Any]) -> None:
+        row = {key: value for key, value in info.items() if not isinstance(value, dict)}
+        if self._writer is None:
+            self._writer = csv.DictWriter(self._file, list(row))
+            self._writer.writeheader()
+            for heading in (0, 1):
+                self._print([f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in self._SHOWN])
+        self._writer.writerow(row)
+        self.num_rows += 1
+        if row["time_s"] >= self._next_s:
+            self._next_s += _SHOWN_S
+            self._file.flush()
+            self._print([format(row[key] * factor, spec) for _, _, key, factor, spec in self._SHOWN])
+
+    def _print(self, cells: list[str]) -> None:
+        self._console.print("".join(cells), soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def _kept(path: Path, console: Console) -> Iterator[_Log]:
+    """A log that stays whatever ends the episode."""
+    with path.open("w", newline="") as file:
+        log = _Log(file, console)
+        try:
+            yield log
+        except BaseException:
+            if log.num_rows:
+                console.print(f"cut short; the {log.num_rows} steps until then are in {path}", soft_wrap=True)
+            else:
+                path.unlink()
+            raise
 
 
 def emulate(config: EmulatorConfig, console: Console) -> None:

@@ -1,7 +1,8 @@
 """`elastic identify`: the static experiment, its files and its table."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,6 +20,7 @@ from elastic_env.robots.testbed import Pendulum
 from train import plots
 from train.runs import run_folder
 from train.testbed_plots import draw_identification
+from train.workers import plain_progress
 
 
 class IdentifyConfig(Model):
@@ -73,12 +75,8 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
     plots.require_matplotlib()
     envs = _environments(config)
     with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
-        columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task("visiting static positions", total=1.0)
-            if config.hardware:
-                bar.stop()  # somebody may be asked something
-            results, points = identify(envs, config.seed, lambda share: bar.update(task, completed=share))
+        with _progress(config, console) as progress:
+            results, points = identify(envs, config.seed, progress)
         results[0].save(folder / "identification.json")
         models = [env.unwrapped.assumed_model for env in envs]
         files = [
@@ -92,6 +90,20 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)
     return results
+
+
+@contextmanager
+def _progress(config: IdentifyConfig, console: Console) -> Iterator[Callable[[float], None]]:
+    """What takes the share of the work that is done."""
+    work = "visiting static positions"
+    if config.hardware:
+        console.print(f"{work} at {config.hardware['port']}", soft_wrap=True)
+        yield plain_progress(console)
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(work, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
 
 
 def result_table(result: Identification) -> Table:

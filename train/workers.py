@@ -24,7 +24,9 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
     process, at whose terminal somebody can agree to them.
     """
     if any(condition.environment.is_real for condition in conditions):
-        return [evaluate(condition) for condition in conditions]
+        return [
+            _on_hardware(condition, f"{n} of {len(conditions)}", console) for n, condition in enumerate(conditions, 1)
+        ]
     steps = [num_steps(condition) for condition in conditions]
     longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
     with progress_bar(console, transient=True) as bar:
@@ -37,6 +39,18 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
         )
         bar.update(task, completed=sum(steps))
     return [results[longest_first.index(number)] for number in range(len(conditions))]
+
+
+def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
+    total, done, say = num_steps(condition), 0, plain_progress(console)
+    console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True)
+
+    def progress(steps: int) -> None:
+        nonlocal done
+        done += steps
+        say(done / total)
+
+    return evaluate(condition, progress)
 
 
 def side_by_side(
@@ -75,6 +89,22 @@ def side_by_side(
             raise
         pool.shutdown()
     return results
+
+
+def plain_progress(console: Console) -> Callable[[float], None]:
+    """A function that takes the share of the work that is done, and says each tenth of it in a line.
+
+    For work beside a control loop: the thread of a `progress_bar` would take time from it.
+    """
+    said = 0
+
+    def progress(share: float) -> None:
+        nonlocal said
+        if int(10 * share) > said:
+            said = int(10 * share)
+            console.print(f"  {10 * said} %")
+
+    return progress
 
 
 def progress_bar(console: Console, transient: bool = False) -> Progress:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.port_lock import lock_port
 
 _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")
@@ -82,11 +83,13 @@ class AttitudeStream:
         wait_s: How long to wait for the first one [s].
 
     Raises:
-        AttitudeError: The port cannot be opened, or nothing comes.
+        PortError: There is no such port, it may not be opened, or another program has it.
+        AttitudeError: Nothing comes that is an attitude.
     """
 
     def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 3.0) -> None:
         self.port, self._oldest_s = port, oldest_s
+        self._lock = lock_port(port)
         file = SharedSample.file()
         self._shared = SharedSample(file)
         self._process = subprocess.Popen(
@@ -123,6 +126,8 @@ class AttitudeStream:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        finally:
+            os.close(self._lock)
 
     def __enter__(self) -> "AttitudeStream":
         return self

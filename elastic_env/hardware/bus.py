@@ -91,6 +91,11 @@ class Bus:
         """Ids of the attached servos, in order."""
         return tuple(self.models)
 
+    @property
+    def names(self) -> list[str]:
+        """How messages call them."""
+        return [f"servo {servo_id} at {self.name}" for servo_id in self.ids]
+
     def scan(self) -> list[Found]:
         """All servos that answer a broadcast ping, by id."""
         with bus_gone(self.name):
@@ -177,7 +182,7 @@ class Bus:
 
     def confirm_torque_off(self) -> list[str]:
         """Servos that do not say that their torque is off, after some tries each."""
-        return [f"servo {i} at {self.name}" for i in self.ids if not self._is_off(i)]
+        return [name for name, i in zip(self.names, self.ids, strict=True) if not self._is_off(i)]
 
     def _is_off(self, servo_id: int) -> bool:
         try:
@@ -288,9 +293,9 @@ class Buses:
         self._readers = [ThreadPoolExecutor(1, thread_name_prefix=bus.name) for bus in buses[1:]]
 
     @property
-    def num_servos(self) -> int:
-        """How many servos there are on all of them."""
-        return sum(len(bus.ids) for bus in self.buses)
+    def names(self) -> list[str]:
+        """How messages call the servos of all of them."""
+        return [name for bus in self.buses for name in bus.names]
 
     def write_goals(self, angles: Array) -> None:
         """Command all servos, (n,) [rad]."""

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 from elastic_env.hardware.bus import Bus
 from elastic_env.hardware.control_table import ServoModel, explain_errors
-from elastic_env.hardware.torque_line import current_of_torque
+from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, current_of_torque
 
 _POSITION_MODE = 3
 _FULL_REPLIES = 2
 _LARGEST_DELAY_S = 20e-6
 _DELAY_UNIT_S = 2e-6
-_TORQUE_NM = 84.0
 _WARM_SHARE = 0.8
 _PINGS = 20
 _SLOW_S = 2.5e-3
@@ -48,7 +47,7 @@ def check_bus(bus: Bus, ids: Sequence[int]) -> list[Check]:
         HardwareError: Its model is not known.
     """
     bus.attach(ids)
-    checks = [_latency_timer(bus), _round_trip(bus, ids[0])]
+    checks = [Check("baud rate", f"{bus.port.baudrate} bit/s"), _latency_timer(bus), _round_trip(bus, ids[0])]
     for servo_id, model in bus.models.items():
         checks += [replace(one, what=f"{servo_id}: {one.what}") for one in _check_servo(bus, servo_id, model)]
     return checks
@@ -87,7 +86,7 @@ def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
     degrees, hottest = get("present_temperature"), get("temperature_limit")
     errors, mode = get("hardware_error_status"), get("operating_mode")
     delay_s = _DELAY_UNIT_S * get("return_delay_time")
-    limit_a, needed_a = get(model.current_limit) * model.current_unit, current_of_torque(_TORQUE_NM)
+    limit_a, needed_a = get(model.current_limit) * model.current_unit, current_of_torque(LARGEST_TORQUE_NM)
     low_rad, high_rad = (get(n) * model.position_unit for n in ("min_position_limit", "max_position_limit"))
     write = "with torque off, write"
     return [
@@ -104,7 +103,7 @@ def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
               unless(get("status_return_level") == _FULL_REPLIES, "write 2 to status_return_level")),
         Check("current limit", f"{limit_a:.1f} A",
               unless(limit_a <= needed_a + 0.1, f"{write} {round(needed_a / model.current_unit)} to "
-                     f"{model.current_limit}: more than {_TORQUE_NM:g} N·m hurts the gear"), is_vital=False),
+                     f"{model.current_limit}: more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"), is_vital=False),
         Check("position limits", f"{low_rad:.2f} to {high_rad:.2f} rad"),
         Check("torque", "on" if get("torque_enable") else "off",
               unless(not get("torque_enable"), "a program left it on; it is switched off before anything begins"),

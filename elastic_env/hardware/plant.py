@@ -2,6 +2,8 @@
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import mujoco
@@ -84,8 +86,8 @@ class ServoPlant:
             HardwareError: Nobody agreed, or something of the hardware is not as it must be.
         """
         self._agree(angle)
-        bus = self._opened()
-        try:
+        with self._or_closed():
+            bus = self._opened()
             bus.disable()
             start = self.settings.joint_angle(float(bus.enable(self.settings.servo_limits)[0]))
             self._restart_clock()
@@ -93,17 +95,11 @@ class ServoPlant:
             self._cycles(angle, _SETTLE_S)
             self.timing = Timing()
             bus.keep(self._servo_goal(angle))
-        except BaseException:
-            self.close()
-            raise
 
     def advance(self, num_substeps: int) -> None:  # noqa: ARG002  one period, whatever the physics would make of it
         """Command `ctrl`, wait for the end of the control period, read."""
-        try:
+        with self._or_closed():
             self._cycle(float(self.ctrl[0, 0]))
-        except BaseException:
-            self.close()
-            raise
 
     def finish(self) -> None:
         """Slowly back to where the pendulum hangs, then torque off; the ports are free for other programs."""
@@ -155,14 +151,22 @@ class ServoPlant:
         settings = self.settings
         if self._bus is None:
             prefer_realtime()
+            self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
             if settings.imu_port is not None:
                 self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s)
-            try:
-                self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
-            except BaseException:
-                self.close()
-                raise
         return self._bus
+
+    @contextmanager
+    def _or_closed(self) -> Iterator[None]:
+        """Torque off and ports closed where what is done within does not succeed; an interrupt then says so."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.close()
+            raise KeyboardInterrupt(f"torque at {self.settings.port} is off") from None
+        except BaseException:
+            self.close()
+            raise
 
     def _agree(self, angle: float) -> None:
         """Ask once before the first motion."""
@@ -177,7 +181,7 @@ class ServoPlant:
         if not sys.stdin.isatty():
             raise HardwareError(
                 f"nobody is at the terminal to agree to a motion at {self.settings.port}; if the way is free, say so "
-                "by confirm=False, or --yes"
+                "by --yes, in Python by confirm=False"
             )
         if input(question).strip().lower() != "yes":
             raise HardwareError(f"nobody agreed to the motion at {self.settings.port}; nothing has moved")

@@ -8,11 +8,9 @@
 | waiting for a reply is a busy loop | `Port` blocks in the read |
 | an interrupted read leaves the port "in use", and torque off is refused | `Port.release` |
 | an unplugged port raises SerialException, or OSError, or termios.error | `bus_gone` makes one error of them |
-| two programs can open one port and speak at the same time | `Port` locks it |
+| two programs can open one port and speak at the same time | `Port` locks it, see `port_lock` |
 """
 
-import errno
-import fcntl
 import os
 import termios
 import time
@@ -24,6 +22,7 @@ from typing import Any, Literal
 from elastic_env.errors import missing_extra
 from elastic_env.hardware import protocol
 from elastic_env.hardware.errors import BusGoneError, PortError
+from elastic_env.hardware.port_lock import cannot_open, lock_port
 
 try:
     import serial
@@ -67,6 +66,7 @@ class Port(PortHandler):
         super().__init__(name)
         self.baudrate = baudrate
         self.reply_timeout_s = 0.05
+        self._lock: int | None = None
 
     def open(self) -> None:
         """Open and lock the port.
@@ -77,18 +77,12 @@ class Port(PortHandler):
         name = self.port_name
         if self.getCFlagBaud(self.baudrate) < 0:
             raise PortError(f"the SDK has no rate of {self.baudrate} bit/s for {name}; try 57600, 1000000 or 3000000")
+        self._lock = lock_port(name)
         try:
             self.setupPort(self.baudrate)
         except serial.SerialException as error:
-            raise _cannot_open(name, error) from None
-        try:
-            fcntl.flock(self.ser.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
             self.closePort()
-            raise PortError(
-                f"another program uses {name}; two on one bus would garble each other's packets. End that program "
-                f"(fuser {name} says which it is), or name another port"
-            ) from None
+            raise cannot_open(name, error) from None
 
     def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: ARG002, N802  the SDK's name
         """Open the device such that a read blocks for a short while instead of not at all."""
@@ -111,10 +105,15 @@ class Port(PortHandler):
 
     def closePort(self) -> None:  # noqa: N802
         """Close; a second time, or without having been open, does nothing."""
-        if self.ser is not None:
-            with bus_gone(self.port_name):
-                self.ser.close()
-        self.is_open = False
+        lock, self._lock = self._lock, None
+        try:
+            if self.ser is not None:
+                with bus_gone(self.port_name):
+                    self.ser.close()
+        finally:
+            self.is_open = False
+            if lock is not None:
+                os.close(lock)
 
     @property
     def latency_timer_ms(self) -> int | None:
@@ -154,14 +153,3 @@ class PacketHandler(Protocol2PacketHandler):
 def _words(error: Exception) -> str:
     """What an error says; termios gives a number and a text."""
     return str(error.args[1]) if len(error.args) > 1 else str(error)
-
-
-def _cannot_open(name: str, error: Any) -> PortError:
-    if error.errno == errno.EACCES:
-        cure = "you may not open it: sudo usermod -aG dialout $USER, then log in again"
-    elif error.errno in (errno.ENOENT, errno.ENXIO) or not Path(name).exists():
-        found = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in Path("/dev").glob(pattern))
-        cure = f"there is no such device; found: {', '.join(found) or 'no USB serial adapter'}"
-    else:
-        cure = str(error)
-    return PortError(f"cannot open the port {name}: {cure}")

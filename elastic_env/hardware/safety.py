@@ -1,5 +1,6 @@
 """Limits on what is commanded and on what is measured, for the last layer before the wire."""
 
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -8,8 +9,10 @@ from pydantic import model_validator
 from elastic_env.config import Model, quantity
 from elastic_env.hardware.bus import States
 from elastic_env.hardware.errors import FaultError
-from elastic_env.hardware.torque_line import torque_of_current
+from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, torque_of_current
 from elastic_env.signals import Array, BoolArray, IntArray
+
+_TORQUE = "torque, by the current, that stops the motion"
 
 
 class SafetyLimits(Model):
@@ -19,7 +22,7 @@ class SafetyLimits(Model):
     highest_rad: float = quantity("rad", 1.6, description="highest goal")
     slew_rad_s: float = quantity("rad/s", 3.0, gt=0, description="fastest change of the goal")
     speed_rad_s: float = quantity("rad/s", 4.5, gt=0, description="measured speed that stops the motion")
-    torque_nm: float = quantity("N·m", 84.0, gt=0, description="torque, by the current, that stops the motion")
+    torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, gt=0, le=LARGEST_TORQUE_NM, description=_TORQUE)
     following_error_rad: float = quantity("rad", 0.35, gt=0, description="distance from the goal that stops it")
     margin_rad: float = quantity("rad", 0.05, ge=0, description="how far beyond the goals' range a position may lie")
     patience_cycles: int = quantity("1", 3, ge=1, le=10, description="cycles without a reply, or too much torque")
@@ -39,21 +42,23 @@ class Guard:
         limits: The limits, the same for all servos.
         measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead away from there as
             fast as the limits allow.
+        names: How messages call the servos, (n,).
 
     Raises:
         FaultError: A position lies outside the goals' range, or is not known.
     """
 
-    def __init__(self, limits: SafetyLimits, measured: Array) -> None:
-        self.limits = limits
+    def __init__(self, limits: SafetyLimits, measured: Array, names: Sequence[str]) -> None:
+        self.limits, self._names = limits, tuple(names)
         self.goals = np.array(measured, dtype=np.float64)
         self._missed: IntArray = np.zeros(len(measured), dtype=np.int64)
         self._strained: IntArray = np.zeros(len(measured), dtype=np.int64)
-        outside = self._outside(self.goals)
-        if outside.any() or not np.isfinite(self.goals).all():
+        outside = self._outside(self.goals) | ~np.isfinite(self.goals)
+        if outside.any():
             raise FaultError(
-                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad, the servos stand "
-                f"at {np.round(self.goals, 3).tolist()} rad; move them by hand while torque is off, or widen the limits"
+                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad in the servos' "
+                f"own angles, not where these stand: {self._which(outside, self.goals)} rad; move them by hand while "
+                "torque is off, correct zero_rad and direction of the mounting, or widen the limits"
             )
 
     @property
@@ -93,23 +98,36 @@ class Guard:
         self._strained = np.where(states.is_fresh & (torque > limits.torque_nm), self._strained + 1, 0)
         if states.has_alert.any():
             return "a servo reports a hardware error"
-        if (self._missed >= limits.patience_cycles).any():
-            return f"no usable reply in {limits.patience_cycles} cycles in a row"
-        if (states.is_fresh & self._outside(states.position)).any():
+        lost = self._missed >= limits.patience_cycles
+        if lost.any():
+            return (
+                f"no usable reply from {self._which(lost)} in {limits.patience_cycles} cycles in a row; look at cables "
+                "and power, the adapter's latency timer, and what else keeps the computer busy: elastic hardware check"
+            )
+        outside = states.is_fresh & self._outside(states.position)
+        if outside.any():
             return (
                 f"a position is outside {limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad: "
-                f"{np.round(states.position, 3).tolist()}"
+                f"{self._which(outside, states.position)} rad"
             )
-        if (states.is_fresh & (np.abs(states.velocity) > limits.speed_rad_s)).any():
-            return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {np.round(states.velocity, 2).tolist()}"
-        if (states.is_fresh & (np.abs(states.position - self.goals) > limits.following_error_rad)).any():
+        fast = states.is_fresh & (np.abs(states.velocity) > limits.speed_rad_s)
+        if fast.any():
+            return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {self._which(fast, states.velocity)} rad/s"
+        behind = states.is_fresh & (np.abs(states.position - self.goals) > limits.following_error_rad)
+        if behind.any():
             return (
-                f"a servo is further than {limits.following_error_rad:g} rad from its goal: positions "
-                f"{np.round(states.position, 3).tolist()}, goals {np.round(self.goals, 3).tolist()} rad"
+                f"a servo is further than {limits.following_error_rad:g} rad from its goal, blocked or overloaded: "
+                f"{self._which(behind, states.position)}, goal {np.round(self.goals[behind], 3).tolist()} rad"
             )
-        if (self._strained >= limits.patience_cycles).any():
-            return f"the torque exceeds {limits.torque_nm:g} N·m: {np.round(torque, 1).tolist()}"
+        strained = self._strained >= limits.patience_cycles
+        if strained.any():
+            return f"the torque exceeds {limits.torque_nm:g} N·m: {self._which(strained, torque)} N·m"
         return ""
+
+    def _which(self, are: BoolArray, values: Array | None = None) -> str:
+        """Names of some servos, with their values."""
+        said = [""] * len(self._names) if values is None else [f": {value:.3f}" for value in values]
+        return ", ".join(name + more for name, more, is_one in zip(self._names, said, are, strict=True) if is_one)
 
     def _outside(self, positions: Array) -> BoolArray:
         low, high = self.limits.lowest_rad - self.limits.margin_rad, self.limits.highest_rad + self.limits.margin_rad

@@ -1,7 +1,10 @@
 """How the testbed is wired and mounted: ports, ids, signs, zeros, limits."""
 
 import math
-from typing import Literal
+import os
+from typing import Literal, Self
+
+from pydantic import model_validator
 
 from elastic_env.config import Model, quantity
 from elastic_env.hardware.safety import SafetyLimits
@@ -30,6 +33,12 @@ class HardwareSettings(Model):
     confirm: bool = True
     """Whether somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = SafetyLimits()
+
+    @model_validator(mode="after")
+    def _ports_differ(self) -> Self:
+        if self.imu_port is not None and os.path.realpath(self.imu_port) == os.path.realpath(self.port):
+            raise ValueError(f"servo and IMU each have a port of their own, got {self.port} for both")
+        return self
 
     def servo_angle(self, joint: float) -> float:
         """Angle in the servo's zero and sign [rad]."""

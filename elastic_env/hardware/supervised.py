@@ -60,6 +60,7 @@ class SupervisedBus:
             )  # fmt: skip
         self._channel = Channel(own)
         self._number = 0
+        self._is_enabled = False
         self._lock = threading.Lock()
         self._keeper: threading.Thread | None = None
         self._is_kept = threading.Event()
@@ -84,8 +85,8 @@ class SupervisedBus:
         Raises:
             FaultError: A servo reports a hardware error, or stands outside the limits.
         """
-        self._limits = limits or SafetyLimits()
-        answer = self._ask("enable", limits=self._limits.model_dump())
+        self._is_enabled = True
+        answer = self._ask("enable", limits=(limits or SafetyLimits()).model_dump())
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
@@ -102,6 +103,9 @@ class SupervisedBus:
         self.stop_keeping()
         try:
             answer = self._ask("exchange", goals=np.asarray(goals, dtype=np.float64).tolist(), at=at)
+        except HardwareError:
+            self._is_enabled = False  # the message says what became of torque
+            raise
         except BaseException:
             self._let_go()
             raise
@@ -144,17 +148,27 @@ class SupervisedBus:
             BusGoneError: The port is gone.
         """
         self.stop_keeping()
+        self._is_enabled = False
         self._ask("disable")
 
     def close(self) -> None:
-        """Torque off, and give the ports back."""
+        """Torque off, and give the ports back; a second time does nothing.
+
+        Raises:
+            ReplyError: A servo does not confirm that its torque is off; the ports are given back all the same.
+            BusGoneError: The port is gone.
+        """
         self.stop_keeping()
-        self._channel.close()
         try:
-            self._process.wait(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            self._process.terminate()
-            self._process.wait(timeout=5.0)
+            if self._is_enabled:
+                self.disable()
+        finally:
+            self._channel.close()
+            try:
+                self._process.wait(timeout=5.0)
+            except subprocess.TimeoutExpired:
+                self._process.terminate()
+                self._process.wait(timeout=5.0)
 
     def __enter__(self) -> "SupervisedBus":
         return self

@@ -97,7 +97,7 @@ class Supervisor:
             for servo_id in bus.ids:
                 self._require_healthy(bus, servo_id)
         measured = np.array([bus.position(servo_id) for bus in self._bus.buses for servo_id in bus.ids])
-        guard = Guard(SafetyLimits(**limits), measured)
+        guard = Guard(SafetyLimits(**limits), measured, self._bus.names)
         self._fault = ""
         try:
             self._write("bus_watchdog", _WATCHDOG_CLEAR)

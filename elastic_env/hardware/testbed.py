@@ -32,6 +32,7 @@ TIMING_METRICS = (
     Metric("jitter_peak_s", "jitter", "peak", over="all"),
     Metric("overruns", "overruns", "max", over="all"),
     Metric("missed_replies", "missed_replies", "max", over="all"),
+    Metric("limited", "limited", "max", over="all"),
 )
 
 

@@ -13,6 +13,8 @@ from elastic_env.signals import Array
 
 TORQUE_PER_CURRENT = 4.338
 """Slope [N·m/A]."""
+LARGEST_TORQUE_NM = 84.0
+"""What the leg's servos of THORMANG3 are limited to, 20 A on this line; more hurts the gear [N·m]."""
 LOSS_NM = 2.694
 """Torque that does not reach the output [N·m]."""
 

@@ -39,7 +39,7 @@ class Check:
     baudrate: int = 3_000_000
     """Bits per second."""
     imu_port: str | None = None
-    """Port of the IMU."""
+    """Port of the IMU, another one than the servos'."""
 
     def run(self) -> None:
         """Check."""
@@ -71,8 +71,8 @@ class Run:
 
         if not (arguments := self.on.arguments):
             raise ConfigurationError("--port is needed; see: elastic hardware scan, elastic hardware emulate")
-        path = run(arguments, motion("hardware", self.reference), PolicySpec(name=self.policy), CONSOLE, self.output)
-        CONSOLE.print(f"wrote {path}", soft_wrap=True)
+        folder = run(arguments, motion("hardware", self.reference), PolicySpec(name=self.policy), CONSOLE, self.output)
+        CONSOLE.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True)
 
 
 @dataclass
@@ -91,7 +91,7 @@ class Emulate:
     stiffness: float | None = None
     """K of the joint [N·m/rad]; default the paper's 1001."""
     lost: float = 0.0
-    """Share of replies that do not come."""
+    """Share of replies that do not come; this and the next three are drawn for every reply, each by itself."""
     late: float = 0.0
     """Share of replies that come 6 ms late."""
     corrupted: float = 0.0

@@ -16,6 +16,9 @@ from elastic_env.errors import ConfigurationError
 CONSOLE = Console()
 """Where the commands say what they do."""
 
+DEFAULT_SCENARIO = "nominal"
+"""Scenario of a simulation where none is named."""
+
 _PARAMETER = re.compile(r"^(?:(?:\w+Config|Condition)\.(\w+)|(reference)s?)(?:\.\d+)?(?=:| must be )", re.MULTILINE)
 
 
@@ -42,12 +45,27 @@ class OnHardware:
         return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
 
 
-def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed."""
+def place(env: str, arguments: dict[str, Any], scenario: str | None = None) -> dict[str, Any]:
+    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed.
+
+    Args:
+        env: Name of the environment.
+        arguments: Those of hardware, empty for the simulation.
+        scenario: What was asked for, which hardware has none of; None for the default.
+
+    Raises:
+        ConfigurationError: Hardware cannot be that.
+    """
     if not arguments:
         return {"env": env}
     if env not in ("testbed", "hardware"):
-        raise ConfigurationError(f"--port is of the testbed, got the environment {env!r}")
+        raise ConfigurationError(
+            f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or --port and --mounting"
+        )
+    if scenario not in (None, DEFAULT_SCENARIO):
+        raise ConfigurationError(
+            f"scenario {scenario!r} is of a simulation, hardware is what it is: leave --scenario out, or --port"
+        )
     return {"env": "hardware", "env_options": arguments}
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from elastic_env.config import load_yaml
-from train.commands.options import CONSOLE, OnHardware, motion, options_named, place, stiffness_option
+from train.commands.options import CONSOLE, DEFAULT_SCENARIO, OnHardware, motion, options_named, place, stiffness_option
 
 
 @dataclass
@@ -21,7 +21,7 @@ class Identify:
     On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
     """
 
-    scenario: str = "nominal"
+    scenario: str = DEFAULT_SCENARIO
     """Scenario of the simulated testbed, such as nominal, ideal, backlash, ideal+soft."""
     stiffness: float | None = None
     """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
@@ -41,9 +41,11 @@ class Identify:
         """Identify, write, print."""
         from train.identify import IdentifyConfig, run_identification
 
+        arguments = self.on.arguments
         with options_named():
+            place("testbed", arguments, self.scenario)
             given = {name: value for name, value in vars(self).items() if name not in ("output", "on")}
-            config = IdentifyConfig(**given, hardware=self.on.arguments)
+            config = IdentifyConfig(**given, hardware=arguments)
         run_identification(config, CONSOLE, self.output)
 
 
@@ -62,7 +64,7 @@ class Evaluate:
     uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one) or walker (a humanoid that walks in place)."""
-    scenario: str = "nominal"
+    scenario: str = DEFAULT_SCENARIO
     """Scenario, such as nominal, ideal, soft, stiff, payload, backlash,
     sensor, ideal+soft; on the walker also spread, push, slope."""
     reference: str | None = None
@@ -91,7 +93,8 @@ class Evaluate:
         arguments = self.on.arguments
         with options_named():
             config = CompareConfig(
-                name="evaluate", references=[motion(self.env, self.reference)], **place(self.env, arguments),
+                name="evaluate", references=[motion(self.env, self.reference)],
+                **place(self.env, arguments, self.scenario),
                 scenarios=["hardware" if arguments else self.scenario],
                 policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes, seed=self.seed,
@@ -152,7 +155,7 @@ class Play:
     """Baseline, or "module:function" for one's own; see elastic evaluate --help."""
     env: str = "testbed"
     """Environment: testbed or walker."""
-    scenario: str = "nominal"
+    scenario: str = DEFAULT_SCENARIO
     """Scenario."""
     reference: str | None = None
     """Motion, as in elastic evaluate; default sine, on the walker 3."""

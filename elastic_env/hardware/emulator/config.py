@@ -1,5 +1,6 @@
 """What an emulator emulates."""
 
+import termios
 from typing import Self
 
 from pydantic import model_validator
@@ -31,6 +32,8 @@ class EmulatorConfig(Model):
     @model_validator(mode="after")
     def _servos_exist(self) -> Self:
         servo_model(self.model_number)
+        if not hasattr(termios, f"B{self.baudrate}"):
+            raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has 57600, 1000000, 3000000")
         wrong = [i for i in self.ids if not 0 <= i <= LARGEST_ID]
         if wrong or not self.ids or len(set(self.ids)) != len(self.ids):
             raise ValueError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {self.ids}")

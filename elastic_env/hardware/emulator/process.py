@@ -31,6 +31,7 @@ from elastic_env.sensors import attitude
 _PHYSICS_S = 2e-3
 _UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
+_OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
 @dataclass
@@ -62,6 +63,10 @@ class Terminal:
         with contextlib.suppress(OSError):
             return os.read(self.master, 4096)
         return b""
+
+    def speaks(self, baudrate: int) -> bool:
+        """Whether the program at the other end has set a baud rate; one that the system has no name for passes."""
+        return termios.tcgetattr(self.slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}", None)
 
     def close(self) -> None:
         """Take it away, as an unplugged adapter is."""
@@ -107,7 +112,10 @@ class Emulator:
         for servo in self._servos:
             servo.watch(now)
         if self.bus_terminal is not None and self.bus_terminal.master in ready:
-            for packet in self._parser.feed(self.bus_terminal.read()):
+            heard = self.bus_terminal.read()
+            if not self.bus_terminal.speaks(self.config.baudrate):
+                heard = b""  # noise
+            for packet in self._parser.feed(heard):
                 if packet.instruction == protocol.SYNC_READ:
                     for servo in self._servos:
                         self.events.append((now, servo.servo_id, "present_position", servo.present_position))

@@ -1,0 +1,58 @@
+"""One program per serial port: the lock that everything that opens one takes first, before it touches the line."""
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+from elastic_env.hardware.errors import PortError
+
+
+def lock_port(name: str) -> int:
+    """Take a serial port for this program alone, without changing its settings or reading from it.
+
+    Args:
+        name: Device, such as /dev/ttyUSB0.
+
+    Returns:
+        A descriptor; the port is given back when it is closed, and by the system when the program ends.
+
+    Raises:
+        PortError: There is no such port, it may not be opened, or another program has it.
+    """
+    try:
+        descriptor = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        raise cannot_open(name, error) from None
+    try:
+        if not os.isatty(descriptor):
+            raise PortError(f"cannot open the port {name}: it is no serial port; {_what_there_is()}")
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise PortError(
+            f"another program uses {name}; two on one bus would garble each other's packets. End that program "
+            f"(fuser {name} says which it is), or name another port"
+        ) from None
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def cannot_open(name: str, error: OSError) -> PortError:
+    """What to do about a port that the system does not open."""
+    if error.errno == errno.EACCES:
+        cure = "you may not open it: sudo usermod -aG dialout $USER, then log in again"
+    elif error.errno in (errno.ENOENT, errno.ENXIO) or not Path(name).exists():
+        cure = f"there is no such device; {_what_there_is()}"
+    elif Path(name).is_dir():
+        cure = f"it is a folder; {_what_there_is()}"
+    else:
+        cure = error.strerror or str(error)
+    return PortError(f"cannot open the port {name}: {cure}")
+
+
+def _what_there_is() -> str:
+    found = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in Path("/dev").glob(pattern))
+    return f"found: {', '.join(found) or 'no USB serial adapter'}"
