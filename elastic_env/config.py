@@ -129,7 +129,9 @@ def _explain_one(model: type[BaseModel], problem: Mapping[str, Any]) -> str:
     if problem["type"] == "extra_forbidden":
         return str(unknown_name(f"parameter of {model.__name__}", name, model.model_fields))
     if problem["type"] == "missing":
-        return f"{model.__name__} needs the parameter {name!r}{_unit(model, name)}"
+        field = model.model_fields.get(name)
+        meaning = f": {field.description}" if field is not None and field.description else ""
+        return f"{model.__name__} needs the parameter {name!r}{_unit(model, name)}{meaning}"
     if problem["type"] == "value_error":
         message = str(problem["ctx"]["error"])
         return f"{name}: {message}" if name else message

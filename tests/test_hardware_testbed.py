@@ -118,8 +118,9 @@ def test_a_stalled_imu_ends_the_episode_with_torque_off(emulator: RunningEmulato
     env = make_hardware(emulator, imu_port=emulator.imu_port)
     env.reset()
     emulator.faults(imu_silent=True)
-    with pytest.raises(AttitudeError, match="has sent no attitude"):
+    with pytest.raises(AttitudeError, match="has sent no attitude") as caught:
         _step_for(env, 1.0)
+    assert caught.value.__notes__ == [f"torque at {emulator.port} is off"]
     assert emulator.state()["torque_on"] == [False]
 
 
@@ -187,7 +188,7 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
     given = hardware_arguments("/dev/ttyUSB7", "/dev/ttyACM7", mounting, yes=False)
     assert (given["port"], given["imu_port"], given["direction"]) == ("/dev/ttyUSB7", "/dev/ttyACM7", -1)
     for text, port, words in (
-        ("direction: -1", None, "'port'"),
+        ("direction: -1", None, "'port': .* --port"),
         ("limits: 5", "p", "limits must be a mapping"),
         ("limits: {torque_nm: 200}", "p", "<= 84"),
         ("imu_port: p", "p", "port of their own"),
@@ -230,6 +231,8 @@ def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) ->
         (["evaluate", "--port", "/dev/null", "--scenario", "soft"], "--scenario"),
         (["identify", "--port", "/dev/null", "--imu-port", "p", "--scenario", "soft"], "--scenario"),
         (["hardware", "check", "/dev/null", "--imu-port", "/dev/null"], "port of their own"),
+        (["hardware", "check", "/dev/null", "--ids"], "ids must be different"),
+        (["hardware", "check", "/dev/null", "--ids", "300"], "from 0 to 252"),
         (["hardware", "scan", "/dev/null"], "no serial port"),
         (["hardware", "scan", "/tmp"], "a folder"),
         (["identify", "--port", "/dev/null"], "--imu-port"),

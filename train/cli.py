@@ -29,6 +29,11 @@ Command = (
 )
 
 
+def _with_notes(error: BaseException, said: str | None = None) -> str:
+    """What an error says, and what was noted on its way here."""
+    return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
     if "" not in sys.path and str(Path.cwd()) not in sys.path:
@@ -41,8 +46,8 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         command.run()
     except ElasticError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        Console(stderr=True).print(f"[bold red]error:[/] {escape(_with_notes(error))}", highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt as error:
-        Console(stderr=True).print("; ".join(["interrupted", *map(str, error.args)]), markup=False, soft_wrap=True)
+        Console(stderr=True).print(_with_notes(error, "interrupted"), highlight=False, markup=False, soft_wrap=True)
         os._exit(130)  # worker processes must not keep the terminal waiting

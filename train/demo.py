@@ -43,7 +43,10 @@ _WALK = CompareConfig(
     name="demo",
     env="walker",
     references=[3],
-    policies=[PolicySpec(name=name) for name in ("uncompensated", "input_output", "input_wrench")],
+    policies=[
+        *(PolicySpec(name=name) for name in ("uncompensated", "input_output", "input_wrench")),
+        PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
+    ],
 )
 _PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
 """Angle error of the pelvis in the paper, in both gaits [mrad]."""

@@ -22,6 +22,7 @@ from elastic_env.hardware.checks import Check, check_bus
 from elastic_env.hardware.control_table import servo_models
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.protocol import require_ids
 from elastic_env.hardware.settings import HardwareSettings
 from train.conditions import PolicySpec
 from train.environments import environment
@@ -84,6 +85,7 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
 def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, console: Console) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
     HardwareSettings(port=port, imu_port=imu_port)
+    require_ids(ids)
     with Bus(port, baudrate) as bus:
         checks = check_bus(bus, ids)
     if imu_port is not None:

@@ -146,7 +146,7 @@ class AttitudeStream:
             )
         return AttitudeError(
             f"the IMU at {self.port} has sent no attitude for {1e3 * (time.monotonic() - last.time_s):.0f} ms, "
-            f"{1e3 * self._oldest_s:.0f} ms are allowed"
+            f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s); look at its cable and its data rate"
         )
 
 

@@ -115,9 +115,11 @@ class Bus:
         """Take servos into the cycle; each is asked for its model, which decides on its registers.
 
         Raises:
+            ConfigurationError: Ids that no servo can have, or one twice.
             ReplyError: A servo does not answer.
             HardwareError: Its model is not known.
         """
+        protocol.require_ids(ids)
         self.models = {servo_id: servo_model(self.ping(servo_id).model_number) for servo_id in ids}
         if len({model.block_address for model in self.models.values()}) > 1:
             names = ", ".join(f"{servo_id}: {model.name}" for servo_id, model in self.models.items())
@@ -248,8 +250,8 @@ class Bus:
                     return data
             self._wait_for_silence()
         raise ReplyError(
-            f"servo {servo_id} at {self.name} does not answer ({self.port.baudrate} bit/s); check power, wiring, id "
-            "and baud rate, see: elastic hardware scan"
+            f"servo {servo_id} at {self.name} does not answer in {_TRIES} tries ({self.port.baudrate} bit/s); check "
+            "power, wiring, id and baud rate, see: elastic hardware scan"
         )
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:

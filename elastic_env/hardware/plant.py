@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.hardware.attitude import AttitudeStream, link_angle
-from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.realtime import give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle, SupervisedBus
@@ -109,12 +109,15 @@ class ServoPlant:
             self.close()
 
     def close(self) -> None:
-        """Torque off; ports closed."""
+        """Torque off; ports closed. An error or an interrupt on whose way out this happens gets a note of it."""
         bus, self._bus = self._bus, None
         imu, self._imu = self._imu, None
         try:
             if bus is not None:
                 bus.close()
+                why = sys.exception()
+                if why is not None and not isinstance(why, FaultError | BusGoneError):  # which say it themselves
+                    why.add_note(f"torque at {self.settings.port} is off")
         finally:
             if imu is not None:
                 imu.close()
@@ -158,12 +161,9 @@ class ServoPlant:
 
     @contextmanager
     def _or_closed(self) -> Iterator[None]:
-        """Torque off and ports closed where what is done within does not succeed; an interrupt then says so."""
+        """Torque off and ports closed where what is done within does not succeed."""
         try:
             yield
-        except KeyboardInterrupt:
-            self.close()
-            raise KeyboardInterrupt(f"torque at {self.settings.port} is off") from None
         except BaseException:
             self.close()
             raise
@@ -183,7 +183,11 @@ class ServoPlant:
                 f"nobody is at the terminal to agree to a motion at {self.settings.port}; if the way is free, say so "
                 "by --yes, in Python by confirm=False"
             )
-        if input(question).strip().lower() != "yes":
+        try:
+            answer = input(question)
+        except EOFError:
+            answer = ""
+        if answer.strip().lower() != "yes":
             raise HardwareError(f"nobody agreed to the motion at {self.settings.port}; nothing has moved")
         self._is_agreed = True
 

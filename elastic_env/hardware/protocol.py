@@ -6,7 +6,10 @@ Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a hea
 checksum count what is sent.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from elastic_env.errors import ConfigurationError
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -36,6 +39,16 @@ STATUS_ERRORS = {
 _POLYNOMIAL = 0x8005
 _LONGEST = 1024
 _STUFFED = b"\xff\xff\xfd"
+
+
+def require_ids(ids: Sequence[int]) -> None:
+    """Check the ids of the servos on a bus.
+
+    Raises:
+        ConfigurationError: None are given, one of them twice, or one that no servo can have.
+    """
+    if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
+        raise ConfigurationError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {list(ids)}")
 
 
 def _crc_of_byte(byte: int) -> int:

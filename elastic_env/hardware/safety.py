@@ -1,5 +1,6 @@
 """Limits on what is commanded and on what is measured, for the last layer before the wire."""
 
+import math
 from collections.abc import Sequence
 from typing import Self
 
@@ -12,19 +13,20 @@ from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, torque_of_current
 from elastic_env.signals import Array, BoolArray, IntArray
 
+_TURN = 2.0 * math.pi
 _TORQUE = "torque, by the current, that stops the motion"
 
 
 class SafetyLimits(Model):
     """What no command may exceed, and what stops the motion when it is measured; angles as the servo has them."""
 
-    lowest_rad: float = quantity("rad", -1.6, description="lowest goal")
-    highest_rad: float = quantity("rad", 1.6, description="highest goal")
-    slew_rad_s: float = quantity("rad/s", 3.0, gt=0, description="fastest change of the goal")
-    speed_rad_s: float = quantity("rad/s", 4.5, gt=0, description="measured speed that stops the motion")
+    lowest_rad: float = quantity("rad", -1.6, ge=-_TURN, le=_TURN, description="lowest goal")
+    highest_rad: float = quantity("rad", 1.6, ge=-_TURN, le=_TURN, description="highest goal")
+    slew_rad_s: float = quantity("rad/s", 3.0, gt=0, le=10, description="fastest change of the goal")
+    speed_rad_s: float = quantity("rad/s", 4.5, gt=0, le=10, description="measured speed that stops the motion")
     torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, gt=0, le=LARGEST_TORQUE_NM, description=_TORQUE)
-    following_error_rad: float = quantity("rad", 0.35, gt=0, description="distance from the goal that stops it")
-    margin_rad: float = quantity("rad", 0.05, ge=0, description="how far beyond the goals' range a position may lie")
+    following_error_rad: float = quantity("rad", 0.35, gt=0, le=1.5, description="distance from the goal that stops it")
+    margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5, description="how far beyond that range a position may lie")
     patience_cycles: int = quantity("1", 3, ge=1, le=10, description="cycles without a reply, or too much torque")
     hang_s: float = quantity("s", 0.05, gt=0, le=0.09, description="time without a command that stops the motion")
 

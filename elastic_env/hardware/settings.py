@@ -14,7 +14,7 @@ class HardwareSettings(Model):
     """What only a real testbed has; the angles of its limits are those of the joint."""
 
     port: str
-    """Port of the servo, such as /dev/ttyUSB0, or of an emulator."""
+    """Port of the servo, such as /dev/ttyUSB0, or of an emulator; on the command line --port."""
     servo_id: int = quantity("1", 1, ge=0, le=252, description="id of the servo")
     baudrate: int = quantity("bit/s", 3_000_000, gt=0, description="rate of the servo's bus")
     direction: Literal[1, -1] = 1
@@ -23,7 +23,7 @@ class HardwareSettings(Model):
     imu_port: str | None = None
     """Port of the IMU on the link; without one everything that needs the link angle is nan."""
     imu_baudrate: int = quantity("bit/s", 115_200, gt=0, description="rate of the IMU's port")
-    imu_oldest_s: float = quantity("s", 0.05, gt=0, le=1, description="age at which an attitude counts as missing")
+    imu_oldest_s: float = quantity("s", 0.05, ge=0.01, le=1, description="age at which an attitude counts as missing")
     imu_axis: Literal["roll", "pitch", "yaw"] = "roll"
     """Euler angle that turns with the joint."""
     imu_sign: Literal[1, -1] = 1

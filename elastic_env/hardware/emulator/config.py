@@ -8,7 +8,7 @@ from pydantic import model_validator
 from elastic_env.config import Model, quantity
 from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.protocol import LARGEST_ID
+from elastic_env.hardware.protocol import require_ids
 from elastic_env.tasks.testbed_config import TestbedConfig
 
 
@@ -34,7 +34,5 @@ class EmulatorConfig(Model):
         servo_model(self.model_number)
         if not hasattr(termios, f"B{self.baudrate}"):
             raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has 57600, 1000000, 3000000")
-        wrong = [i for i in self.ids if not 0 <= i <= LARGEST_ID]
-        if wrong or not self.ids or len(set(self.ids)) != len(self.ids):
-            raise ValueError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {self.ids}")
+        require_ids(self.ids)
         return self

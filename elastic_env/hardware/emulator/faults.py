@@ -12,10 +12,10 @@ class Faults(Model):
 
     lost: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that do not come")
     late: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that come late")
-    late_s: float = quantity("s", 0.006, ge=0, description="how late")
+    late_s: float = quantity("s", 0.006, ge=0, le=1, description="how late")
     corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of replies with a flipped bit")
     truncated: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that end too early")
-    latency_s: float = quantity("s", 0.0, ge=0, description="delay of every reply: the adapter's latency timer")
+    latency_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of every reply: the adapter's latency timer")
     overload: bool = False
     """Whether the servos report an overload and let go."""
     silent: bool = False
