@@ -6,10 +6,11 @@ bend:
 
 .. math:: \lambda = \overline{f_{xy} / f_z - \ddot c_{xy} / g}
 
-where the mean of the acceleration over a time t is a difference of velocities, known from the motors to some σ_v, so
-that with σ_λ before any measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The attitude less this tilt is one
-that the robot made itself. The weight leans too, and acts at the center of mass, h over the ankles: set upright, it
-leaves the ankles with the wrenches of level ground,
+as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in that of the pelvis, which is parallel to
+them but for what the joints bend. The mean of the acceleration over a time t is a difference of velocities, known from
+the motors to some σ_v, so that with σ_λ before any measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The
+attitude less this tilt is one that the robot made itself. The weight leans too, and acts at the center of mass, h over
+the ankles: set upright, it leaves the ankles with the wrenches of level ground,
 
 .. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
 """
@@ -105,10 +106,7 @@ class GroundLevel:
         """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded one, (n, 2)."""
         n = len(rows)
         theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
-        now, soon = (self._from_ankles(angles) for angles in (theta, theta + _DIFFERENCE_S * rate))
+        com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))
+        now, soon = com[:, :, None] - ankles
         velocity = (soon - now)[..., :2] / _DIFFERENCE_S
         return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]
-
-    def _from_ankles(self, theta: Array) -> Array:
-        com, ankles = self._carried.com_and_feet(theta)
-        return com[:, None] - ankles

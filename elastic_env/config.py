@@ -203,6 +203,8 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
         content = parse_yaml(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
+    if content is None and changes:
+        content = {}
     if not isinstance(content, dict):
         got = "an empty file" if content is None else type(content).__name__
         raise ConfigurationError(f"{file} must hold a mapping of parameters, such as 'name: value', got {got}")

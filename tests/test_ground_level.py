@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.ground_level import GroundLevel
+from baselines.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel
 from elastic_env.signals import Array
 from elastic_env.walking.ground_contact import zero_moment_point
 
@@ -112,6 +112,30 @@ def test_the_mean_forgets_and_waits_for_feet_that_are_loaded() -> None:
         memory = mean(0.0, 300.0, memory)
     before = mean(3.0, 300.0, memory)[0, 2]
     np.testing.assert_allclose(before, -(1.0 - np.exp(-0.1)) * 0.01, rtol=1e-6)
+
+
+def test_acceleration_and_certainty_have_their_closed_forms() -> None:
+    """Catches a sign, a factor or an axis of the acceleration, and a first estimate that is believed at once."""
+    model = walker("ideal").unwrapped.assumed_model
+    ground, table, chains = GroundLevel(model, PERIOD_S), model.observation_table, model.biped.chains_above_feet
+    rates = np.zeros((2, 6))
+    rates[:, 1] = 0.3  # both hips roll: the body goes sideways
+    rates[:, 2] = 0.2  # and pitch
+    ahead, behind = (chains.com_and_feet(step * rates) for step in (1e-4, -1e-4))
+    velocity = ((ahead[0] - ahead[1][0]) - (behind[0] - behind[1][0]))[:2] / 2e-4
+    rows = np.zeros((2, len(table)))
+    rows[1, table.group("encoder_rate")] = rates.ravel()
+    direction = velocity / (9.81 * PERIOD_S)
+    assert np.abs(direction).min() > 0.01
+    rows[:, table.group("wrench")] = [300.0 * direction[0], 300.0 * direction[1], 300.0, 0.0, 0.0, 0.0] * 2
+    _, memory = ground.observe(rows[:1], ground.begin(1))
+    np.testing.assert_allclose(ground.observe(rows[1:], memory)[1][0, 1:3], 0.0, atol=1e-5)
+
+    tilt = np.array([-direction[1], direction[0]])  # the same force on a robot that stands: the ground leans
+    for number in range(1, 20):
+        values, memory = ground.observe(rows[:1], memory)
+        certainty = 1.0 / (1.0 + (VELOCITY_M_PER_S / (9.81 * number * PERIOD_S * TILT_RAD)) ** 2)
+        np.testing.assert_allclose(values[0, :2], certainty * tilt, rtol=1e-3)
 
 
 def test_what_accelerates_is_no_slope() -> None:

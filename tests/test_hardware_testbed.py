@@ -192,7 +192,8 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
         ("limits: 5", "p", "limits must be a mapping"),
         ("limits: {torque_nm: 200}", "p", "<= 84"),
         ("imu_port: p", "p", "port of their own"),
-        ("", "p", "an empty file"),
+        ("", None, "an empty file"),
+        ("limits: {highest_rad: 4}\nzero_rad: 3", "p", "zero_rad 3 are 1.40 to 7.00 rad"),
     ):
         mounting.write_text(text)
         with pytest.raises(ConfigurationError, match=words):

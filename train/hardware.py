@@ -84,7 +84,7 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
 
 def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, console: Console) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
-    HardwareSettings(port=port, imu_port=imu_port)
+    HardwareSettings(port=port, imu_port=imu_port)  # which refuses one port for both
     require_ids(ids)
     with Bus(port, baudrate) as bus:
         checks = check_bus(bus, ids)

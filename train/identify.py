@@ -75,8 +75,12 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
     plots.require_matplotlib()
     envs = _environments(config)
     with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
-        with _progress(config, console) as progress:
-            results, points = identify(envs, config.seed, progress)
+        try:
+            with _progress(config, console) as progress:
+                results, points = identify(envs, config.seed, progress)
+        finally:
+            for env in envs:
+                env.close()
         results[0].save(folder / "identification.json")
         models = [env.unwrapped.assumed_model for env in envs]
         files = [

@@ -89,21 +89,34 @@ class AttitudeStream:
 
     def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 3.0) -> None:
         self.port, self._oldest_s = port, oldest_s
-        self._lock = lock_port(port)
+        self._lock: int | None = lock_port(port)
+        self._process: subprocess.Popen[str] | None = None
+        try:
+            self._shared = self._begin(port, baudrate)
+            deadline = time.monotonic() + wait_s
+            while self._shared.get() is None:
+                if self._has_ended or time.monotonic() > deadline:
+                    raise self._silent()
+                time.sleep(0.01)
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self, port: str, baudrate: int) -> SharedSample:
+        """Start the reader."""
         file = SharedSample.file()
-        self._shared = SharedSample(file)
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)],
-            pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        )  # fmt: skip
-        os.close(file)
-        deadline = time.monotonic() + wait_s
-        while self._shared.get() is None:
-            if self._process.poll() is not None or time.monotonic() > deadline:
-                error = self._silent()
-                self.close()
-                raise error
-            time.sleep(0.01)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)],
+                pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            )  # fmt: skip
+            return SharedSample(file)
+        finally:
+            os.close(file)
+
+    @property
+    def _has_ended(self) -> bool:
+        return self._process is None or self._process.poll() is not None
 
     def latest(self) -> Attitude:
         """The newest sample.
@@ -117,17 +130,15 @@ class AttitudeStream:
         return sample
 
     def close(self) -> None:
-        """End the reader."""
-        for pipe in (self._process.stdin, self._process.stderr):
-            if pipe is not None:
-                pipe.close()
+        """End the reader, and give the port back; a second time does nothing."""
+        process, self._process = self._process, None
+        lock, self._lock = self._lock, None
         try:
-            self._process.wait(timeout=2.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            if process is not None:
+                _end(process)
         finally:
-            os.close(self._lock)
+            if lock is not None:
+                os.close(lock)
 
     def __enter__(self) -> "AttitudeStream":
         return self
@@ -136,8 +147,11 @@ class AttitudeStream:
         self.close()
 
     def _silent(self, last: Attitude | None = None) -> AttitudeError:
-        if self._process.poll() is not None and self._process.stderr is not None:
-            said = self._process.stderr.read().strip().splitlines()
+        process = self._process
+        if process is None:
+            return AttitudeError(f"the IMU at {self.port} is closed")
+        if process.poll() is not None and process.stderr is not None:
+            said = process.stderr.read().strip().splitlines()
             return AttitudeError(f"the IMU at {self.port} cannot be read: {said[-1] if said else 'its reader ended'}")
         if last is None:
             return AttitudeError(
@@ -148,6 +162,18 @@ class AttitudeStream:
             f"the IMU at {self.port} has sent no attitude for {1e3 * (time.monotonic() - last.time_s):.0f} ms, "
             f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s); look at its cable and its data rate"
         )
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """End a reader: it stops when its input is closed."""
+    for pipe in (process.stdin, process.stderr):
+        if pipe is not None:
+            pipe.close()
+    try:
+        process.wait(timeout=2.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def link_angle(sample: Attitude, axis: Axis, sign: int, offset_rad: float) -> float:

@@ -58,12 +58,17 @@ class Bus:
     Args:
         port: Device, such as /dev/ttyUSB0.
         baudrate: Bits per second.
+
+    Attributes:
+        models: Types of the attached servos, by id.
+        num_retries: Requests that were sent again because no reply came, or none that was intact.
     """
 
     def __init__(self, port: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
         self.name = port
         self.port = Port(port, baudrate)
         self.models: dict[int, ServoModel] = {}
+        self.num_retries = 0
         self._handler = PacketHandler()
         self._requests = 0
 
@@ -249,6 +254,7 @@ class Bus:
                 if answered == servo_id and len(data) == length:
                     return data
             self._wait_for_silence()
+            self.num_retries += 1
         raise ReplyError(
             f"servo {servo_id} at {self.name} does not answer in {_TRIES} tries ({self.port.baudrate} bit/s); check "
             "power, wiring, id and baud rate, see: elastic hardware scan"

@@ -16,7 +16,7 @@ _DELAY_UNIT_S = 2e-6
 _WARM_SHARE = 0.8
 _PINGS = 50
 _LOST = 2
-"""Pings that need a second try from which a line counts as bad; a busy computer may cost one."""
+"""Replies lost or damaged from which a line counts as bad; a busy computer may cost one."""
 _SLOW_S = 2.5e-3
 
 
@@ -64,22 +64,21 @@ def _latency_timer(bus: Bus) -> Check:
 
 
 def _round_trips(bus: Bus, servo_id: int) -> list[Check]:
-    times = []
+    times, retries = [], bus.num_retries
     for _ in range(_PINGS):
         begin = time.monotonic()
         bus.ping(servo_id)
         times.append(time.monotonic() - begin)
-    answered = [t for t in times if t < bus.port.reply_timeout_s] or times
-    lost, typical = len(times) - len(answered), statistics.median(times)
+    lost, typical = bus.num_retries - retries, statistics.median(times)
     slow = (
         "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to 0, and the bus to "
         "1 Mbit/s or more"
     )
     bad = "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer busy"
-    trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(answered):.2f} ms"
+    trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(times):.2f} ms"
     return [
         Check("round trip of a ping", trip, "" if typical < _SLOW_S else slow),
-        Check("lost replies", f"{lost} of {_PINGS}", "" if lost < _LOST else bad, is_vital=False),
+        Check("lost replies", f"{lost} to {_PINGS} pings", "" if lost < _LOST else bad, is_vital=False),
     ]
 
 

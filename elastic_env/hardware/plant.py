@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.hardware.attitude import AttitudeStream, link_angle
-from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
+from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.realtime import give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle, SupervisedBus
@@ -116,7 +116,7 @@ class ServoPlant:
             if bus is not None:
                 bus.close()
                 why = sys.exception()
-                if why is not None and not isinstance(why, FaultError | BusGoneError):  # which say it themselves
+                if why is not None and bus.is_confirmed_off:
                     why.add_note(f"torque at {self.settings.port} is off")
         finally:
             if imu is not None:
@@ -153,8 +153,8 @@ class ServoPlant:
     def _opened(self) -> SupervisedBus:
         settings = self.settings
         if self._bus is None:
-            prefer_realtime()
             self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
+            prefer_realtime()
             if settings.imu_port is not None:
                 self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s)
         return self._bus

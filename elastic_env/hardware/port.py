@@ -80,9 +80,12 @@ class Port(PortHandler):
         self._lock = lock_port(name)
         try:
             self.setupPort(self.baudrate)
-        except serial.SerialException as error:
+        except (OSError, termios.error) as error:  # of which SerialException is one
             self.closePort()
-            raise cannot_open(name, error) from None
+            raise cannot_open(name, error.args[0], _words(error)) from None
+        except BaseException:
+            self.closePort()
+            raise
 
     def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: ARG002, N802  the SDK's name
         """Open the device such that a read blocks for a short while instead of not at all."""

@@ -23,34 +23,40 @@ def lock_port(name: str) -> int:
     try:
         descriptor = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
-        raise cannot_open(name, error) from None
+        raise cannot_open(name, error.errno, str(error.strerror)) from None
     try:
         if not os.isatty(descriptor):
             raise PortError(f"cannot open the port {name}: it is no serial port; {_what_there_is()}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise PortError(
-            f"another program uses {name}; two on one bus would garble each other's packets. End that program "
-            f"(fuser {name} says which it is), or name another port"
-        ) from None
+        raise _taken(name) from None
     except BaseException:
         os.close(descriptor)
         raise
     return descriptor
 
 
-def cannot_open(name: str, error: OSError) -> PortError:
-    """What to do about a port that the system does not open."""
-    if error.errno == errno.EACCES:
+def cannot_open(name: str, number: object, words: str) -> PortError:
+    """What to do about a port that the system does not open, by the number of its error and what it says."""
+    if number == errno.EBUSY:
+        return _taken(name)
+    if number == errno.EACCES:
         cure = "you may not open it: sudo usermod -aG dialout $USER, then log in again"
-    elif error.errno in (errno.ENOENT, errno.ENXIO) or not Path(name).exists():
+    elif number in (errno.ENOENT, errno.ENXIO) or not Path(name).exists():
         cure = f"there is no such device; {_what_there_is()}"
     elif Path(name).is_dir():
         cure = f"it is a folder; {_what_there_is()}"
     else:
-        cure = error.strerror or str(error)
+        cure = words
     return PortError(f"cannot open the port {name}: {cure}")
+
+
+def _taken(name: str) -> PortError:
+    return PortError(
+        f"another program uses {name}; two on one bus would garble each other's packets. End that program "
+        f"(fuser {name} says which it is), or name another port"
+    )
 
 
 def _what_there_is() -> str:

@@ -40,6 +40,16 @@ class HardwareSettings(Model):
             raise ValueError(f"servo and IMU each have a port of their own, got {self.port} for both")
         return self
 
+    @model_validator(mode="after")
+    def _limits_are_a_turn(self) -> Self:
+        ends = sorted(map(self.servo_angle, (self.limits.lowest_rad, self.limits.highest_rad)))
+        if ends[0] < -2.0 * math.pi or ends[1] > 2.0 * math.pi:
+            raise ValueError(
+                f"lowest_rad {self.limits.lowest_rad:g} and highest_rad {self.limits.highest_rad:g} with zero_rad "
+                f"{self.zero_rad:g} are {ends[0]:.2f} to {ends[1]:.2f} rad of the servo, which has ±{2 * math.pi:.2f}"
+            )
+        return self
+
     def servo_angle(self, joint: float) -> float:
         """Angle in the servo's zero and sign [rad]."""
         return self.direction * joint + self.zero_rad

@@ -44,6 +44,9 @@ class SupervisedBus:
         ports: Ids of the servos by port; arrays of all servos have them in this order.
         baudrate: Bits per second.
 
+    Attributes:
+        is_confirmed_off: Whether all servos have said that their torque is off, and nothing has enabled it since.
+
     Raises:
         PortError: A port cannot be had.
         ReplyError: A servo does not answer.
@@ -61,6 +64,7 @@ class SupervisedBus:
         self._channel = Channel(own)
         self._number = 0
         self._is_enabled = False
+        self.is_confirmed_off = False
         self._lock = threading.Lock()
         self._keeper: threading.Thread | None = None
         self._is_kept = threading.Event()
@@ -85,7 +89,7 @@ class SupervisedBus:
         Raises:
             FaultError: A servo reports a hardware error, or stands outside the limits.
         """
-        self._is_enabled = True
+        self._is_enabled, self.is_confirmed_off = True, False
         answer = self._ask("enable", limits=(limits or SafetyLimits()).model_dump())
         return np.array(answer["position"])
 
@@ -148,8 +152,9 @@ class SupervisedBus:
             BusGoneError: The port is gone.
         """
         self.stop_keeping()
-        self._is_enabled = False
+        self._is_enabled = self.is_confirmed_off = False
         self._ask("disable")
+        self.is_confirmed_off = True
 
     def close(self) -> None:
         """Torque off, and give the ports back; a second time does nothing.
@@ -158,7 +163,6 @@ class SupervisedBus:
             ReplyError: A servo does not confirm that its torque is off; the ports are given back all the same.
             BusGoneError: The port is gone.
         """
-        self.stop_keeping()
         try:
             if self._is_enabled:
                 self.disable()

@@ -45,28 +45,26 @@ class OnHardware:
         return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
 
 
-def place(env: str, arguments: dict[str, Any], scenario: str | None = None) -> dict[str, Any]:
-    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed.
-
-    Args:
-        env: Name of the environment.
-        arguments: Those of hardware, empty for the simulation.
-        scenario: What was asked for, which hardware has none of; None for the default.
-
-    Raises:
-        ConfigurationError: Hardware cannot be that.
-    """
+def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed."""
     if not arguments:
         return {"env": env}
     if env not in ("testbed", "hardware"):
         raise ConfigurationError(
             f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or --port and --mounting"
         )
-    if scenario not in (None, DEFAULT_SCENARIO):
-        raise ConfigurationError(
-            f"scenario {scenario!r} is of a simulation, hardware is what it is: leave --scenario out, or --port"
-        )
     return {"env": "hardware", "env_options": arguments}
+
+
+def scenario_played(asked: str | None, arguments: dict[str, Any]) -> str:
+    """The scenario that was asked for, or the default; on hardware, which has none, what stands for it in tables."""
+    if not arguments:
+        return DEFAULT_SCENARIO if asked is None else asked
+    if asked is not None:
+        raise ConfigurationError(
+            f"scenario {asked!r} is of a simulation, hardware is what it is: leave --scenario out, or --port"
+        )
+    return "hardware"
 
 
 @contextmanager

@@ -7,7 +7,16 @@ from typing import Annotated, Any
 import tyro
 
 from elastic_env.config import load_yaml
-from train.commands.options import CONSOLE, DEFAULT_SCENARIO, OnHardware, motion, options_named, place, stiffness_option
+from train.commands.options import (
+    CONSOLE,
+    DEFAULT_SCENARIO,
+    OnHardware,
+    motion,
+    options_named,
+    place,
+    scenario_played,
+    stiffness_option,
+)
 
 
 @dataclass
@@ -21,8 +30,8 @@ class Identify:
     On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
     """
 
-    scenario: str = DEFAULT_SCENARIO
-    """Scenario of the simulated testbed, such as nominal, ideal, backlash, ideal+soft."""
+    scenario: str | None = None
+    """Scenario of the simulated testbed, such as nominal (default), ideal, backlash, ideal+soft."""
     stiffness: float | None = None
     """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
     second_mass: float | None = None
@@ -43,9 +52,8 @@ class Identify:
 
         arguments = self.on.arguments
         with options_named():
-            place("testbed", arguments, self.scenario)
-            given = {name: value for name, value in vars(self).items() if name not in ("output", "on")}
-            config = IdentifyConfig(**given, hardware=arguments)
+            given = {name: value for name, value in vars(self).items() if name not in ("output", "on", "scenario")}
+            config = IdentifyConfig(**given, scenario=scenario_played(self.scenario, arguments), hardware=arguments)
         run_identification(config, CONSOLE, self.output)
 
 
@@ -64,8 +72,8 @@ class Evaluate:
     uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one) or walker (a humanoid that walks in place)."""
-    scenario: str = DEFAULT_SCENARIO
-    """Scenario, such as nominal, ideal, soft, stiff, payload, backlash,
+    scenario: str | None = None
+    """Scenario, such as nominal (default), ideal, soft, stiff, payload, backlash,
     sensor, ideal+soft; on the walker also spread, push, slope."""
     reference: str | None = None
     """Motion. Testbed: hold (default), sine, multisine, steps,
@@ -94,8 +102,8 @@ class Evaluate:
         with options_named():
             config = CompareConfig(
                 name="evaluate", references=[motion(self.env, self.reference)],
-                **place(self.env, arguments, self.scenario),
-                scenarios=["hardware" if arguments else self.scenario],
+                **place(self.env, arguments),
+                scenarios=[scenario_played(self.scenario, arguments)],
                 policies=[PolicySpec(name=self.policy, options=options)],
                 episodes=self.episodes, seed=self.seed,
             )  # fmt: skip

@@ -66,7 +66,7 @@ class Terminal:
 
     def speaks(self, baudrate: int) -> bool:
         """Whether the program at the other end has set a baud rate; one that the system has no name for passes."""
-        return termios.tcgetattr(self.slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}", None)
+        return termios.tcgetattr(self.slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}")
 
     def close(self) -> None:
         """Take it away, as an unplugged adapter is."""
