@@ -26,10 +26,9 @@ _COLOURS = {
     "oracle": "#8e5ea2",
 }
 _STRONG = ("#d6006c", "#e69500", "#3d3df5", "#00a63e", "#111111", "#00a5cf", "#a05a00", "#8a8a8a")
-"""Of residuals and of one's own policies in the report: far from the baselines' and from one another."""
+"""Of residuals and of one's own policies: far from the baselines' and from one another."""
 FAILED = "#111111"
 """Colour of the mark of a failure that belongs to no policy alone."""
-_OTHERS = ("#bc8034", "#3d8b8b", "#8d5524", "#d1495b", "#4a4e69")
 _DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 
@@ -62,11 +61,6 @@ def require_matplotlib() -> Any:
         }
     )
     return plt
-
-
-def colour(policy: str, index: int = 0) -> str:
-    """Colour of a policy, the same in every figure."""
-    return _COLOURS.get(policy, _OTHERS[index % len(_OTHERS)])
 
 
 def colours(policies: Sequence[str]) -> dict[str, str]:
@@ -135,13 +129,13 @@ _ROOMY = 7
 
 def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]) -> None:
     """A bar per policy in every group."""
-    width = 0.84 / len(policies)
+    width, shades = 0.84 / len(policies), colours(policies)
     for place, evaluation in ((place, e) for place, group in enumerate(groups.values()) for e in group):
         policy = evaluation.condition.policy.title
         index = policies.index(policy)
         x = place + (index - (len(policies) - 1) / 2) * width
         values = column.scale * evaluation.values(column.metric)
-        shade = colour(policy, index)
+        shade = shades[policy]
         axis.bar(x, np.median(values) if len(values) else 0.0, width=0.9 * width, color=shade)
         if len(evaluation.episodes) > 1:
             axis.scatter(np.full(len(values), x), values, s=4, color="#222222", alpha=0.45, lw=0, zorder=3)
@@ -161,7 +155,7 @@ def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, p
 
 def _legend(figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int) -> None:
     """Policies, and the mark of failures if there are any."""
-    handles = [axis.bar(np.nan, 0.0, color=colour(policy, i), label=policy) for i, policy in enumerate(policies)]
+    handles = [axis.bar(np.nan, 0.0, color=shade, label=policy) for policy, shade in colours(policies).items()]
     if any(evaluation.num_failed for evaluation in evaluations):
         failure = evaluations[0].condition.environment.failure
         handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))

@@ -10,7 +10,7 @@ import numpy as np
 from elastic_env.signals import Array
 from train.environments import Column
 from train.evaluate import Evaluation
-from train.plots import colour, columns_of, line_style, require_matplotlib, save
+from train.plots import colours, columns_of, line_style, require_matplotlib, save
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +71,12 @@ def draw_sweep(curves: Sequence[Curve], label: str, path: Path) -> Path:
     panels = list(axes[:, 0])
     swept = sorted({value for curve in curves for value in curve.x.tolist()})
     panels[0].set_title(_title(curves))
+    shades = colours([curve.policy for curve in curves])
     if failing:
-        _draw_failures(panels[0], failing, curves, first.environment.failure)
+        _draw_failures(panels[0], failing, curves, shades, first.environment.failure)
     for axis, column in zip(panels[-len(columns) :], columns, strict=True):
-        for index, curve in enumerate(curves):
-            _draw_curve(axis, curve, column, index)
+        for curve in curves:
+            _draw_curve(axis, curve, column, shades[curve.policy])
         axis.set_yscale("log")
         _plain_ticks(axis.yaxis)
         axis.set_ylabel(column.label)
@@ -97,18 +98,20 @@ def _title(curves: Sequence[Curve]) -> str:
     return title[0].upper() + title[1:]
 
 
-def _draw_curve(axis: Any, curve: Curve, column: Column, index: int) -> None:
-    shade, median = colour(curve.policy, index), curve.median(column)
+def _draw_curve(axis: Any, curve: Curve, column: Column, shade: str) -> None:
+    median = curve.median(column)
     if curve.is_level:
         axis.axhline(median[0], color=shade, lw=1.2, ls=":", label=curve.policy)
         return
     axis.plot(curve.x, median, color=shade, lw=1.5, ls=line_style(curve.policy), marker="o", ms=4, label=curve.policy)
 
 
-def _draw_failures(axis: Any, failing: Sequence[Curve], curves: Sequence[Curve], what: str) -> None:
+def _draw_failures(
+    axis: Any, failing: Sequence[Curve], curves: Sequence[Curve], shades: dict[str, str], what: str
+) -> None:
     """A row of crosses per policy that fails somewhere."""
     for row, curve in enumerate(reversed(failing)):
-        shade = colour(curve.policy, curves.index(curve))
+        shade = shades[curve.policy]
         swept = curve.x if not curve.is_level else np.array(sorted({x for c in curves for x in c.x.tolist()}))
         share = np.broadcast_to(curve.failed_share, swept.shape)
         for chosen, face in ((share == 1.0, shade), ((share > 0.0) & (share < 1.0), "none")):

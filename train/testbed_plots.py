@@ -11,7 +11,7 @@ from baselines.static_points import StaticPoints, link_torque
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array
 from train.evaluate import Evaluation
-from train.plots import MRAD, colour, require_matplotlib, save
+from train.plots import MRAD, colours, require_matplotlib, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
@@ -65,27 +65,32 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
     plt = require_matplotlib()
     figure, axis = plt.subplots(figsize=(7.6, 4.4))
-    gravity = [make_gravity(model)]
+    gravity, shades = [make_gravity(model)], _shades(evaluations)
     for index, evaluation in enumerate(evaluations):
         policy, points = evaluation.condition.policy.title, evaluation.points
         if points is None:
             continue
         error = MRAD * static_errors(evaluation)
         marker, face = "xosDv^"[index % 6], None if index == 0 else "none"
-        style = {"facecolors": face, "edgecolors": colour(policy, index)} if face else {"color": colour(policy, index)}
+        shade = shades[policy]
+        style = {"facecolors": face, "edgecolors": shade} if face else {"color": shade}
         low, high = error.min(), error.max()
         axis.scatter(
             link_torque(points, gravity, points.q), error, marker=marker, s=34, linewidths=1.3, zorder=3,
             label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}", **style,
         )  # fmt: skip
-        axis.axhspan(low, high, color=colour(policy, index), alpha=0.08, lw=0)
+        axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
         for bound in _PAPER_RANGES_MRAD.get(policy, ()):
-            axis.axhline(bound, color=colour(policy, index), lw=0.9, ls=":")
+            axis.axhline(bound, color=shade, lw=0.9, ls=":")
     axis.set_title(f"Link error at rest, scenario {evaluations[0].condition.scenario}")
     axis.set_xlabel("gravity torque at the link angle [N·m]")
     axis.set_ylabel("q_ref − q by the link's IMU [mrad]")
     axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), fontsize=9)
     return save(figure, path)
+
+
+def _shades(evaluations: Sequence[Evaluation]) -> dict[str, str]:
+    return colours([evaluation.condition.policy.title for evaluation in evaluations])
 
 
 def static_errors(evaluation: Evaluation) -> Array:
@@ -104,11 +109,12 @@ def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
     top.plot(first.trace["time_s"], first.trace["reference_angle"], color="#333333", lw=1.2)
     top.set_ylabel("q_ref [rad]")
     top.set_title(f"{first.condition.reference_name}, scenario {first.condition.scenario}")
-    for index, evaluation in enumerate(evaluations):
+    shades = _shades(evaluations)
+    for evaluation in evaluations:
         policy = evaluation.condition.policy.title
         bottom.plot(
             evaluation.trace["time_s"], MRAD * evaluation.trace["link_error"], lw=1.1,
-            color=colour(policy, index), label=policy,
+            color=shades[policy], label=policy,
         )  # fmt: skip
     bottom.axhline(0.0, color="#888888", lw=0.8)
     bottom.set_ylabel("link error q_ref − q [mrad]")

@@ -12,7 +12,7 @@ import numpy as np
 from elastic_env.signals import Array
 from train.conditions import Condition
 from train.evaluate import Evaluation
-from train.plots import FAILED, MM, MRAD, colour, columns_of, line_style, require_matplotlib, save
+from train.plots import FAILED, MM, MRAD, colours, columns_of, line_style, require_matplotlib, save
 
 _SHADE = "#e9ebee"
 _BEFORE_FALL_S = 0.6
@@ -92,9 +92,10 @@ def _draw_lines(
     bottom, top = scale * min(low), scale * max(high)
     margin = 0.08 * (top - bottom) + 1e-9
     axis.set_ylim(bottom - margin, top + margin)
-    for index, evaluation in enumerate(evaluations):
+    shades = colours([evaluation.condition.policy.title for evaluation in evaluations])
+    for evaluation in evaluations:
         policy, trace = evaluation.condition.policy.title, evaluation.trace
-        shade = colour(policy, index)
+        shade = shades[policy]
         axis.plot(trace["time_s"], scale * trace[signal], color=shade, lw=1.1, ls=line_style(policy), label=policy)
         if evaluation.first_failed:
             last = trace[signal][np.isfinite(trace[signal])][-1:]
