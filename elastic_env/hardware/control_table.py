@@ -56,6 +56,7 @@ class ControlTable(Mapping[str, Register]):
 
     def __init__(self, registers: list[Register]) -> None:
         self._registers = {register.name: register for register in sorted(registers, key=lambda r: r.address)}
+        self._at = {address: r for r in self._registers.values() for address in range(r.address, r.end)}
 
     def __getitem__(self, name: str) -> Register:
         if name not in self._registers:
@@ -73,7 +74,7 @@ class ControlTable(Mapping[str, Register]):
 
     def at(self, address: int) -> Register | None:
         """The register that holds an address, or None."""
-        return next((r for r in self._registers.values() if r.address <= address < r.end), None)
+        return self._at.get(address)
 
     @property
     def size(self) -> int:
@@ -106,7 +107,7 @@ class ServoModel:
         """Whether the servo stops by itself when the bus falls silent."""
         return "bus_watchdog" in self.table
 
-    @property
+    @functools.cached_property
     def block_address(self) -> int:
         """Where the block begins that holds position, velocity and current."""
         return min(self.table[name].address for name in _BLOCK)

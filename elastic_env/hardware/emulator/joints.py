@@ -40,14 +40,18 @@ class Joints:
 
     def advance(self, now_s: float) -> None:
         """Let the joints move until the clock says now."""
-        lag = now_s - self._clock
-        if lag > _LARGEST_LAG_S:
-            self.skipped_s += lag - _LARGEST_LAG_S
-            self._clock = now_s - _LARGEST_LAG_S
-        steps = int((now_s - self._clock) / self._timestep)
+        excess = self.lag(now_s) - _LARGEST_LAG_S
+        if excess > 0.0:
+            self.skipped_s += excess
+            self._clock += excess
+        steps = int(self.lag(now_s) / self._timestep)
         if steps > 0:
             self._simulation.advance(steps)
             self._clock += steps * self._timestep
+
+    def lag(self, now_s: float) -> float:
+        """How far the joints are behind the clock [s]."""
+        return now_s - self._clock
 
     def command(self, index: int, angle: float) -> None:
         """Goal of a servo [rad]."""

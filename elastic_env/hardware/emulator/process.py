@@ -3,6 +3,7 @@
 import contextlib
 import fcntl
 import json
+import math
 import os
 import pty
 import select
@@ -28,7 +29,8 @@ from elastic_env.hardware.emulator.wire import EmulatedBus
 from elastic_env.hardware.realtime import prefer_realtime
 from elastic_env.sensors import attitude
 
-_PHYSICS_S = 2e-3
+_PHYSICS_S, _LONGEST_PHYSICS_S = 1e-3, 5e-3  # between two advances: as a rule, and while replies go out
+_PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at once, or what it has after that time
 _UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
@@ -91,7 +93,8 @@ class Emulator:
         self.bus_terminal: Terminal | None = Terminal.opened()
         self.imu_terminal = Terminal.opened()
         self.faults = config.faults
-        self._generator = np.random.default_rng(config.seed)
+        # of the line and of the IMU: who asks for replies gets the same faults, whatever the time
+        self._line, self._imu = np.random.default_rng(config.seed).spawn(2)
         self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
         self._servos = [
             EmulatedServo(servo_id, model, self._note, config.claimed_model_number, JointState())
@@ -107,11 +110,15 @@ class Emulator:
         sources = [self.bus_terminal.master] if self.bus_terminal is not None else []
         ready, _, _ = select.select([*sources, *([] if control is None else [control])], [], [], self._idle(wait_s))
         now = time.monotonic()
-        self._joints.advance(now)
-        self._measure()
+        self._send_due(now)  # replies wait for nothing
+        has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
+        if has_heard or not self._replies or self._joints.lag(now) > _LONGEST_PHYSICS_S:
+            self._joints.advance(now)
+        if has_heard or any(servo.is_watched for servo in self._servos):
+            self._measure()
         for servo in self._servos:
             servo.watch(now)
-        if self.bus_terminal is not None and self.bus_terminal.master in ready:
+        if self.bus_terminal is not None and has_heard:
             heard = self.bus_terminal.read()
             if not self.bus_terminal.speaks(self.config.baudrate):
                 heard = b""  # noise
@@ -155,13 +162,23 @@ class Emulator:
         }
 
     def _idle(self, wait_s: float) -> float:
-        due = [self._replies[0][0]] if self._replies else []
-        return max(min([time.monotonic() + min(wait_s, _PHYSICS_S), self._next_imu_s, *due]) - time.monotonic(), 0.0)
+        now = time.monotonic()
+        return max(min(now + min(wait_s, _PHYSICS_S), self._next_imu_s, self._next_packet_s()) - now, 0.0)
+
+    def _next_packet_s(self) -> float:
+        """When the adapter has enough replies to pass on, or has waited long enough."""
+        at, length = math.inf, 0
+        for due, reply in self._replies:
+            if due > self._replies[0][0] + _PACKET_S:
+                break
+            at, length = due, length + len(reply)
+            if length >= _PACKET_BYTES:
+                break
+        return at
 
     def _note(self, servo_id: int, name: str, value: int) -> None:
         self.events.append((time.monotonic(), servo_id, name, value))
-        index = next(i for i, servo in enumerate(self._servos) if servo.servo_id == servo_id)
-        servo = self._servos[index]
+        index, servo = next((i, servo) for i, servo in enumerate(self._servos) if servo.servo_id == servo_id)
         if name == "torque_enable":
             self._joints.set_torque(index, bool(value))
             self._joints.command(index, servo.goal)
@@ -169,15 +186,15 @@ class Emulator:
             self._joints.command(index, servo.goal)
 
     def _measure(self) -> None:
-        values = zip(self._servos, self._joints.theta, self._joints.theta_dot, self._joints.motor_torque, strict=True)
-        for servo, theta, theta_dot, torque in values:
-            servo.joint.position, servo.joint.velocity = float(theta), float(theta_dot)
-            servo.joint.torque = float(torque) if servo.is_on else 0.0
+        values = (x.tolist() for x in (self._joints.theta, self._joints.theta_dot, self._joints.motor_torque))
+        for servo, theta, theta_dot, torque in zip(self._servos, *values, strict=True):
+            servo.joint.position, servo.joint.velocity = theta, theta_dot
+            servo.joint.torque = torque if servo.is_on else 0.0
             servo.measure()
 
     def _queue(self, replies: list[bytes], now: float) -> None:
         for reply in replies:
-            sent, delay = damage(self.faults, reply, self._generator)
+            sent, delay = damage(self.faults, reply, self._line)
             wire_s = self.config.return_delay_s + 10.0 * len(reply) / self.config.baudrate
             begin = max(now + delay, self._replies[-1][0] if self._replies else now)
             if sent:
@@ -197,18 +214,18 @@ class Emulator:
         self._next_imu_s = max(self._next_imu_s + period, now)
         if self.faults.imu_silent:
             return
-        noise = self._generator.standard_normal(1)
+        noise = self._imu.standard_normal(1)
         roll = attitude(self.config.testbed.scenario.imu, self._joints.q[:1], np.zeros(1), noise)
         sent = attitude_packet(float(roll[0]), 0.0, 0.0, now - self._start_s)
-        if self._generator.random() < self.faults.imu_corrupted:
-            sent = flip_bit(sent, self._generator)
+        if self._imu.random() < self.faults.imu_corrupted:
+            sent = flip_bit(sent, self._imu)
         self.imu_terminal.write(sent)
 
 
 def serve(config: EmulatorConfig) -> None:
     """Emulate until the input ends; requests come as JSON lines, one each, and so do the answers."""
-    prefer_realtime()
     emulator = Emulator(config)
+    prefer_realtime()
     answer: Any = emulator.ports
     pending = b""
     while True:

@@ -70,6 +70,11 @@ class EmulatedServo:
         return bool(self._get("torque_enable"))
 
     @property
+    def is_watched(self) -> bool:
+        """Whether its bus watchdog is set."""
+        return self.model.has_watchdog and self._get("bus_watchdog") > 0
+
+    @property
     def goal(self) -> float:
         """Goal position [rad]."""
         return self._get("goal_position") * self.model.position_unit
@@ -97,10 +102,7 @@ class EmulatedServo:
 
         Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus Watchdog).
         """
-        if not self.model.has_watchdog:
-            return
-        limit = self._get("bus_watchdog") * _WATCHDOG_UNIT_S
-        if limit > 0.0 and now_s - self._heard_s > limit:
+        if self.is_watched and now_s - self._heard_s > self._get("bus_watchdog") * _WATCHDOG_UNIT_S:
             self._change("goal_position", self.present_position)
             self._change("bus_watchdog", _WATCHDOG_FIRED)
 
