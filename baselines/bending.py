@@ -18,7 +18,6 @@ import numpy as np
 from baselines.compensators import GravityCompensator
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array, BoolArray
-from elastic_env.walking.leg_chains import Vector
 from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
 
 LOADED_SHARE = 0.15
@@ -101,14 +100,14 @@ class BendingObserver:
         bent = bending.reshape(len(rows), 2, -1).transpose(2, 0, 1)
         chains = self._model.biped.chains
         posture = chains.posture(theta.reshape(len(rows), 2, -1))
-        zero: Array = np.zeros(bent.shape[1:])
-        normal: Vector = [zero, zero, zero + 1.0]
-        turn: Vector = [zero, zero, zero]
+        normal, turn = pair = np.zeros((2, 3, *bent.shape[1:]))
+        normal[2] = 1.0
+        vectors = pair.swapaxes(0, 1)
         for j in range(len(chains.axis) - 1, -1, -1):
-            normal, turn = posture.into_parent(j, normal), posture.into_parent(j, turn)
-            turn[chains.axis[j]] = turn[chains.axis[j]] + bent[j]
+            posture.into_parent(j, vectors, out=vectors)
+            turn[chains.axis[j]] += bent[j]
         R = (rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])).swapaxes(-1, -2)
-        up, expected = np.stack(normal, axis=-1) @ R, np.stack(turn, axis=-1) @ R
+        up, expected = (np.moveaxis(vector, 0, -1) @ R for vector in pair)
         return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
 
 

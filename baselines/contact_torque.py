@@ -14,18 +14,16 @@ In single support over its foot, `com` is the exact multibody torque.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
 from elastic_env.walking.contact_force import shares
-from elastic_env.walking.leg_chains import FootWrenches, LegChains, LegPosture, LegWeights
+from elastic_env.walking.leg_chains import LegChains, LegLoads, LegPosture
 
 ContactMethod = Literal["com", "ankle", "lumped"]
-
-_Statics = TypeVar("_Statics")
 
 _LEGS, _PER_LEG = 2, 6
 
@@ -76,7 +74,7 @@ class BoundContactGravity:
     def __init__(self, model: WalkerModel, weights: Array, in_sole: Array, gravity: Array, legs_weigh: bool) -> None:
         chains = model.biped.chains
         lifted = -chains.mass * weights  # what the ground carries is a negative mass where it does
-        self._legs = _Memo(chains, lambda legs: LegWeights(legs, gravity, lifted, in_sole, legs_weigh))
+        self._legs = _Memo(chains, lambda legs: LegLoads(legs, gravity, lifted, in_sole, legs_weigh=legs_weigh))
 
     def gravity_torque(self, q: Array) -> Array:
         """See `GravityModel`."""
@@ -116,14 +114,12 @@ class BoundWrenchTorque:
 
     def __init__(self, model: WalkerModel, wrench: Array, gravity: Array) -> None:
         force, moment = wrench[..., 0, :], wrench[..., 1, :]
-        self._legs = _Memo(
-            model.biped.chains_above_feet, lambda legs: (LegWeights(legs, gravity), FootWrenches(legs, force, moment))
-        )
+        chains = model.biped.chains_above_feet
+        self._legs = _Memo(chains, lambda legs: LegLoads(legs, gravity, wrench=(force, moment)))
 
     def gravity_torque(self, q: Array) -> Array:
         """See `GravityModel`."""
-        weights, wrenches = self._legs.at(q)
-        return (weights.torque() + wrenches.torque()).reshape(q.shape)
+        return self._legs.at(q).torque().reshape(q.shape)
 
     def gravity_gradient(self, q: Array) -> Array:
         """See `GravityModel`; not symmetric, since the wrench turns with its foot."""
@@ -131,8 +127,7 @@ class BoundWrenchTorque:
 
     def gradient_by_leg(self, q: Array) -> Array:
         """∂τ/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        weights, wrenches = self._legs.at(q)
-        return weights.gradient() + wrenches.gradient()
+        return self._legs.at(q).gradient()
 
 
 class PlannedTorque:
@@ -171,14 +166,14 @@ class BoundPlannedTorque:
         return self.torque + self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
 
 
-class _Memo(Generic[_Statics]):
-    """Statics of legs at the last joint angles: torque and gradient are asked for at the same ones."""
+class _Memo:
+    """Loads of legs at the last joint angles: torque and gradient are asked for at the same ones."""
 
-    def __init__(self, chains: LegChains, make: Callable[[LegPosture], _Statics]) -> None:
+    def __init__(self, chains: LegChains, make: Callable[[LegPosture], LegLoads]) -> None:
         self._chains, self._make = chains, make
-        self._last: tuple[Array, _Statics] | None = None
+        self._last: tuple[Array, LegLoads] | None = None
 
-    def at(self, q: Array) -> _Statics:
+    def at(self, q: Array) -> LegLoads:
         """At joint angles, (num_worlds, 12) [rad]."""
         if self._last is None or self._last[0] is not q:
             posture = self._chains.posture(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))

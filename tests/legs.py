@@ -3,7 +3,7 @@
 import numpy as np
 
 from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import FootWrenches, LegChains, LegWeights
+from elastic_env.walking.leg_chains import LegChains, LegLoads
 
 
 def foot_frames(chains: LegChains, q: Array) -> tuple[Array, Array]:
@@ -19,5 +19,5 @@ def holding_torque(
     """Torques of legs under forces at points and moments about them, (..., L, 3) each, all in the pelvis frame."""
     legs, (ankle, R) = chains.posture(q), foot_frames(chains, q)
     about_ankle = np.cross(point - ankle, force) + (0.0 if moment is None else moment)
-    seen = [np.einsum("...ji,...j->...i", R, vector) for vector in (force, about_ankle)]
-    return LegWeights(legs, gravity).torque() + FootWrenches(legs, *seen).torque()
+    seen = (np.einsum("...ji,...j->...i", R, force), np.einsum("...ji,...j->...i", R, about_ankle))
+    return LegLoads(legs, gravity, wrench=seen).torque()

@@ -12,7 +12,7 @@ from elastic_env.errors import ConfigurationError
 from elastic_env.rigid_body import FloatingBody
 from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped
 from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import FootWrenches, LegChains, LegWeights
+from elastic_env.walking.leg_chains import LegChains, LegLoads
 from tests.legs import foot_frames, holding_torque
 
 ROBOT = biped(Thormang())
@@ -139,7 +139,7 @@ def test_holding_torque_is_the_bias_force_less_the_contact_forces(name: str) -> 
         torque = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains), posed.moment)
         np.testing.assert_allclose(torque, posed.torque(posed.q, moment=True), rtol=0.0, atol=1e-9)
         bias = posed.data.qfrc_bias[posed.model.jnt_dofadr[posed.joints]]
-        unloaded = LegWeights(chains.posture(posed.q), posed.gravity).torque()
+        unloaded = LegLoads(chains.posture(posed.q), posed.gravity).torque()
         np.testing.assert_allclose(unloaded, bias, rtol=0.0, atol=1e-9)
 
 
@@ -148,7 +148,7 @@ def test_holding_torque_is_that_of_pinocchio() -> None:
     q = np.random.default_rng(3).uniform(-1.0, 1.0, (20, 12))
     still, rest = np.zeros((20, 3)), np.zeros((20, 12))
     _, expected = FloatingBody(ROBOT.rigid, LEG_JOINTS).inverse_dynamics(q, still, rest, still, rest)
-    torque = LegWeights(ROBOT.chains.posture(q.reshape(20, 2, 6)), ROBOT.rigid.opt.gravity).torque()
+    torque = LegLoads(ROBOT.chains.posture(q.reshape(20, 2, 6)), ROBOT.rigid.opt.gravity).torque()
     np.testing.assert_allclose(torque.reshape(20, 12), expected, rtol=0.0, atol=1e-10)
 
 
@@ -162,8 +162,8 @@ def test_a_mass_in_the_foot_is_a_force_that_gravity_directs(name: str, legs_weig
         posed.force = mass[:, None] * posed.gravity
         expected = holding_torque(chains, posed.q, posed.gravity, posed.force, posed.point(chains))
         if not legs_weigh:
-            expected -= LegWeights(chains.posture(posed.q), posed.gravity).torque()
-        statics = LegWeights(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot, legs_weigh)
+            expected -= LegLoads(chains.posture(posed.q), posed.gravity).torque()
+        statics = LegLoads(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot, legs_weigh=legs_weigh)
         np.testing.assert_allclose(statics.torque(), expected, rtol=0.0, atol=1e-9)
         assert np.abs(expected).max() > 50.0
 
@@ -179,7 +179,7 @@ def test_feet_that_a_sensor_weighs_weigh_nothing(name: str) -> None:
     assert chains.mass == pytest.approx(mujoco.mj_getTotalmass(footless), rel=1e-12)
     assert chains.mass < mujoco.mj_getTotalmass(model) - 1.0
     np.testing.assert_allclose(chains.center_of_mass(q), expected.center_of_mass(q), rtol=0.0, atol=1e-12)
-    one, other = (LegWeights(legs.posture(q), model.opt.gravity).torque() for legs in (chains, expected))
+    one, other = (LegLoads(legs.posture(q), model.opt.gravity).torque() for legs in (chains, expected))
     np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
     assert ROBOT.chains_above_feet.mass == pytest.approx(57.0 - 2.0 * 1.616, abs=1e-9)
 
@@ -192,7 +192,7 @@ def test_gradient_of_weights_is_the_difference_quotient_of_mujocos_torque(name: 
         posed = Posed(name, seed)
         chains, mass = LegChains(posed.model, posed.legs), np.array([-30.0, 12.0, -7.0][: len(posed.legs)])
         posed.force = mass[:, None] * posed.gravity
-        gradient = LegWeights(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot).gradient()
+        gradient = LegLoads(chains.posture(posed.q), posed.gravity, mass, posed.point_of_foot).gradient()
         legs, joints = posed.q.shape
         for j in range(joints):
             step = np.zeros((legs, joints))
@@ -223,7 +223,7 @@ def test_gradient_of_wrenches_is_the_difference_quotient_of_jacobians(name: str)
     for seed in range(3):
         posed = Posed(name, seed)
         chains = LegChains(posed.model, posed.legs)
-        wrenches = FootWrenches(chains.posture(posed.q), posed.force, posed.moment)
+        wrenches = LegLoads(chains.posture(posed.q), wrench=(posed.force, posed.moment))
         np.testing.assert_allclose(wrenches.torque(), torque(posed, posed.q), rtol=0.0, atol=1e-9)
         gradient = wrenches.gradient()
         for j in range(posed.q.shape[1]):
@@ -285,8 +285,8 @@ def test_a_row_of_a_batch_is_the_row_alone_bit_for_bit(shape: tuple[int, ...]) -
 
     def everything(row: tuple[int, ...]) -> list[Array]:
         legs = chains.posture(q[row])
-        weights = LegWeights(legs, gravity[row], mass[row], offset[row])
-        wrenches = FootWrenches(legs, force[row], moment[row])
+        weights = LegLoads(legs, gravity[row], mass[row], offset[row])
+        wrenches = LegLoads(legs, wrench=(force[row], moment[row]))
         return [
             *chains.com_and_feet(q[row], (0.1, -0.2, 0.3)),
             weights.torque(), weights.gradient(), wrenches.torque(), wrenches.gradient(),
@@ -304,7 +304,7 @@ def test_one_gravity_serves_a_batch() -> None:
     """Catches a gravity that is needed for each world although it is the same in all of them."""
     generator = np.random.default_rng(7)
     legs, gravity = ROBOT.chains.posture(generator.normal(size=(4, 2, 6))), np.array([0.1, 0.2, -9.8])
-    one, each = LegWeights(legs, gravity), LegWeights(legs, np.tile(gravity, (4, 1)))
+    one, each = LegLoads(legs, gravity), LegLoads(legs, np.tile(gravity, (4, 1)))
     np.testing.assert_array_equal(one.torque(), each.torque())
     np.testing.assert_array_equal(one.gradient(), each.gradient())
 

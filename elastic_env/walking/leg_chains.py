@@ -21,8 +21,8 @@ If joint j turns, all that it carries turns about its anchor. For a joint i befo
 * a wrench (f, n) that is fixed in the foot, as a sensor in the foot measures it, changes by z_j × f and z_j × n_j. For
   i = j and i after j nothing changes.
 
-Legs do not couple: the pelvis' orientation is given by g. Vectors are lists of three components here, each an array
-over a batch, (..., L), joints first, so that every operation runs over whole batches.
+Legs do not couple: the pelvis' orientation is given by g. Vectors have their three components first and the batch last,
+(3, ..., L), joints before both, so that every operation runs over whole batches.
 """
 
 from collections.abc import Sequence
@@ -34,13 +34,13 @@ import numpy as np
 from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array, IntArray
 
-Vector: TypeAlias = list[Array]
-"""Three components, (..., L) each."""
 Part: TypeAlias = list[tuple[int, Array]]
 """The components of a constant vector that are not zero, with their values on all legs."""
 
 _OTHERS = {0: (1, 2), 1: (2, 0), 2: (0, 1)}
 """The axes into which the others turn: a rotation about the key turns the first towards the second."""
+_LEVER, _FORCE, _MOMENT = range(3)
+"""What a joint carries: first moment of the masses, and a wrench."""
 
 
 class LegChains:
@@ -107,12 +107,13 @@ class LegChains:
         posture = self.posture(q)
         shape = [2, *[1] * (q.ndim - 2), -1]
         foot = np.broadcast_to(np.asarray(point), self._last_moment.shape)
-        pair = list(np.stack([self._last_moment, foot]).transpose(2, 0, 1).reshape(3, *shape))
+        pair = np.empty((3, 2, *posture.sine.shape[1:]))
+        pair[:] = np.stack([self._last_moment, foot]).transpose(2, 0, 1).reshape(3, *shape)
         for j in range(len(self.axis) - 1, -1, -1):
-            pair = posture.into_parent(j, pair)
+            posture.into_parent(j, pair, out=pair)
             for component, added in self._hung[j]:
                 pair[component] += added.reshape(shape)
-        legs, feet = np.stack(pair, axis=-1)
+        legs, feet = np.moveaxis(pair, 0, -1)
         return (self._fixed_moment + legs.sum(axis=-2)) / self.mass, feet
 
     def _moment_of_the_rest(self, model: mujoco.MjModel, bodies: IntArray) -> Array:
@@ -138,160 +139,139 @@ class LegPosture:
         angles = q.transpose(-1, *range(q.ndim - 1)).copy()
         self.sine, self.cosine = np.sin(angles), np.cos(angles)
 
-    def into_link(self, j: int, vector: Vector) -> Vector:
-        """A vector of the link before joint j in the frame of the link behind it."""
+    def into_link(self, j: int, vectors: Array, out: Array) -> Array:
+        """Vectors of the link before joint j in the frame of the link behind it, (3, ...) to `out`."""
         first, second = _OTHERS[self.chains.axis[j]]
-        s, c, x, y = self.sine[j], self.cosine[j], vector[first], vector[second]
-        turned = vector.copy()
-        turned[first], turned[second] = c * x + s * y, c * y - s * x
-        return turned
+        return self._turned(j, vectors, out, first, second)
 
-    def into_parent(self, j: int, vector: Vector) -> Vector:
-        """A vector of the link behind joint j in the frame of the link before it."""
+    def into_parent(self, j: int, vectors: Array, out: Array) -> Array:
+        """Vectors of the link behind joint j in the frame of the link before it, (3, ...) to `out`, or in place."""
         first, second = _OTHERS[self.chains.axis[j]]
-        s, c, x, y = self.sine[j], self.cosine[j], vector[first], vector[second]
-        turned = vector.copy()
-        turned[first], turned[second] = c * x - s * y, c * y + s * x
-        return turned
+        return self._turned(j, vectors, out, second, first)
+
+    def _turned(self, j: int, vectors: Array, out: Array, first: int, second: int) -> Array:
+        """Seen from a frame that is turned from the first axis to the second."""
+        s, c, x, y = self.sine[j], self.cosine[j], vectors[first], vectors[second]
+        across_x, across_y = s * y, s * x  # before either is written over
+        turned_x, turned_y = out[first], out[second]
+        np.add(np.multiply(c, x, out=turned_x), across_x, out=turned_x)
+        np.subtract(np.multiply(c, y, out=turned_y), across_y, out=turned_y)
+        if out is not vectors:
+            out[self.chains.axis[j]] = vectors[self.chains.axis[j]]
+        return out
 
 
-class LegWeights:
-    """Legs at rest under gravity, with a mass at a point of each foot: negative where the ground carries the foot.
+class LegLoads:
+    """Legs at rest under gravity, under a mass at a point of each foot, and under a wrench on each foot.
+
+    A mass is negative where the ground carries the foot; a wrench is known in the frame of its foot, and turns with it.
 
     Args:
         posture: Where the legs are.
-        gravity: Acceleration of gravity in the pelvis frame, (..., 3) [m/s²].
+        gravity: Acceleration of gravity in the pelvis frame, (..., 3) [m/s²]; None for none.
         mass: At a point of each foot, (..., L) [kg]; None for none.
         point: From the ankle, in the frame of the foot, (..., L, 3) [m].
+        wrench: Force on each foot and moment about its ankle, (..., L, 3) each [N], [N·m]; None for none.
         legs_weigh: Whether the legs themselves have mass.
     """
 
     def __init__(
         self,
         posture: LegPosture,
-        gravity: Array,
+        gravity: Array | None = None,
         mass: Array | None = None,
         point: Array | None = None,
+        wrench: tuple[Array, Array] | None = None,
         legs_weigh: bool = True,
     ) -> None:
         self._posture = posture
-        self._gravity = self._in_links([gravity[..., k, None] for k in range(3)])
-        self._levers = self._hanging(mass, point, legs_weigh)
+        self._gravity = None if gravity is None else self._in_links(gravity)
+        self._has_wrench = wrench is not None
+        self._carried = self._carried_by_joints(mass, point, wrench, legs_weigh)
+        """What each joint carries, in the frame of its link, (J, 3, V, ...): first moment, force, moment."""
 
     def torque(self) -> Array:
         """Joint torques that hold the legs, (..., L, J) [N·m]."""
-        torque = np.empty_like(self._posture.sine)
+        torque = np.zeros_like(self._posture.sine)
         for j, axis in enumerate(self._posture.chains.axis):
-            first, second = _OTHERS[axis]
-            lever, g = self._levers[j], self._gravity[j]
-            np.subtract(lever[second] * g[first], lever[first] * g[second], out=torque[j])
-        return _joints_last(torque)
+            carried, own = self._carried[j], torque[j]
+            if self._gravity is not None:
+                first, second = _OTHERS[axis]
+                lever, g = carried[:, _LEVER], self._gravity[j]
+                np.subtract(lever[second] * g[first], lever[first] * g[second], out=own)
+            if self._has_wrench:
+                np.subtract(own, carried[axis, _MOMENT], out=own)
+        return torque.transpose(*range(1, torque.ndim), 0)
 
     def gradient(self) -> Array:
-        """∂τ/∂q, symmetric, (..., L, J, J) [N·m/rad]."""
+        """∂τ/∂q, (..., L, J, J) [N·m/rad]; symmetric without a wrench."""
         posture, axes = self._posture, self._posture.chains.axis
-        J, batch = len(axes), posture.sine.shape[1:]
-        gradient = np.empty((J, J, *batch))
-        changes = np.empty((3, J, *batch))  # of the moment, by the joints from j on
+        J, V, batch = len(axes), self._carried.shape[2], posture.sine.shape[1:]
+        gradient = np.zeros((J, J, *batch))
+        changes = np.zeros((3, V, J, *batch))  # of what is carried, by the joints from j on
         for j in range(J - 1, -1, -1):
             axis, (first, second) = axes[j], _OTHERS[axes[j]]
-            lever, g, change = self._levers[j], self._gravity[j], changes[:, j]
-            np.multiply(lever[first], g[axis], out=change[first])
-            np.multiply(lever[second], g[axis], out=change[second])
-            np.negative(lever[first] * g[first] + lever[second] * g[second], out=change[axis])
-            np.negative(changes[axis, j:], out=gradient[j, j:])
-            gradient[j + 1 :, j] = gradient[j, j + 1 :]
+            carried, change = self._carried[j], changes[:, :, j]
+            if self._gravity is not None:  # of the moment of the weights
+                lever, g, by_weight = carried[:, _LEVER], self._gravity[j], change[:, _LEVER]
+                np.multiply(lever[first], g[axis], out=by_weight[first])
+                np.multiply(lever[second], g[axis], out=by_weight[second])
+                np.negative(lever[first] * g[first] + lever[second] * g[second], out=by_weight[axis])
+                np.negative(changes[axis, _LEVER, j:], out=gradient[j, j:])
+                gradient[j + 1 :, j] = gradient[j, j + 1 :]
+            if self._has_wrench:
+                np.subtract(gradient[j, j + 1 :], changes[axis, _MOMENT, j + 1 :], out=gradient[j, j + 1 :])
+                np.negative(carried[second, _FORCE:], out=change[first, _FORCE:])
+                change[second, _FORCE:] = carried[first, _FORCE:]
             if j > 0:
-                changes[:, j:] = posture.into_parent(j, list(changes[:, j:]))
+                self._take_across(j, posture.into_parent(j, changes[:, :, j:], out=changes[:, :, j:]))
         return gradient.transpose(*range(2, gradient.ndim), 0, 1)
 
-    def _in_links(self, vector: Vector) -> list[Vector]:
-        """A vector of the pelvis frame in the frames of all links."""
-        frames = []
-        for j in range(len(self._posture.chains.axis)):
-            vector = self._posture.into_link(j, vector)
-            frames.append(vector)
-        return frames
+    def _in_links(self, gravity: Array) -> Array:
+        """Gravity in the frames of all links, (J, 3, ...)."""
+        posture = self._posture
+        links = np.empty((len(posture.chains.axis), 3, *posture.sine.shape[1:]))
+        vector = np.moveaxis(gravity, -1, 0)[..., None]
+        for j, link in enumerate(links):
+            vector = posture.into_link(j, vector, out=link)
+        return links
 
-    def _hanging(self, mass: Array | None, point: Array | None, legs_weigh: bool) -> list[Vector]:
-        """First moment of what each joint carries, from its anchor, in the frame of its link."""
+    def _carried_by_joints(
+        self, mass: Array | None, point: Array | None, wrench: tuple[Array, Array] | None, legs_weigh: bool
+    ) -> Array:
         chains, posture = self._posture.chains, self._posture
-        zero = np.zeros(posture.sine.shape[1:])
-        lever: Vector = [zero, zero, zero]
+        carried = np.zeros((len(chains.axis), 3, 1 if wrench is None else 3, *posture.sine.shape[1:]))
+        foot = carried[-1]
         if mass is not None and point is not None:
-            lever = [mass * point[..., k] for k in range(3)]
-        levers: list[Vector] = []
+            foot[:, _LEVER] = mass * np.moveaxis(point, -1, 0)
+        if wrench is not None:
+            foot[:, _FORCE], foot[:, _MOMENT] = (np.moveaxis(vector, -1, 0) for vector in wrench)
         for j in range(len(chains.axis) - 1, -1, -1):
-            if legs_weigh:
-                lever = lever.copy()
+            if self._gravity is not None and legs_weigh:
                 for k, own in chains.moment[j]:
-                    lever[k] = lever[k] + own
-            levers.append(lever)
-            lever = posture.into_parent(j, lever)
-            if mass is not None:
-                for k, own in chains.offset[j]:
-                    lever[k] = lever[k] + mass * own
-        return levers[::-1]
+                    carried[j, k, _LEVER] += own
+            if j > 0:
+                before = self._take_across(j, posture.into_parent(j, carried[j], out=carried[j - 1]))
+                if mass is not None:
+                    for k, own in chains.offset[j]:
+                        before[k, _LEVER] += mass * own
+        return carried
 
-
-class FootWrenches:
-    """Legs at rest under a wrench on each foot that is known in the frame of the foot.
-
-    Args:
-        posture: Where the legs are.
-        force: On the foot, in its frame, (..., L, 3) [N].
-        moment: About the ankle, likewise [N·m].
-    """
-
-    def __init__(self, posture: LegPosture, force: Array, moment: Array) -> None:
-        self._posture = posture
-        f, n = ([vector[..., k] for k in range(3)] for vector in (force, moment))
-        self._wrenches: list[tuple[Vector, Vector]] = []
-        for j in range(len(posture.chains.axis) - 1, -1, -1):
-            self._wrenches.append((f, n))
-            f, n = posture.into_parent(j, f), posture.into_parent(j, n)
-            for k, own in posture.chains.offset[j]:  # d × f
-                first, second = _OTHERS[k]
-                n[first], n[second] = n[first] - own * f[second], n[second] + own * f[first]
-        self._wrenches.reverse()
-
-    def torque(self) -> Array:
-        """Joint torques that hold the legs against the wrenches, (..., L, J) [N·m]."""
-        torque = np.empty_like(self._posture.sine)
-        for j, axis in enumerate(self._posture.chains.axis):
-            np.negative(self._wrenches[j][1][axis], out=torque[j])
-        return _joints_last(torque)
-
-    def gradient(self) -> Array:
-        """∂τ/∂q with wrenches that turn with their feet, strictly upper triangular, (..., L, J, J) [N·m/rad]."""
-        posture, axes = self._posture, self._posture.chains.axis
-        J, batch = len(axes), posture.sine.shape[1:]
-        gradient = np.zeros((J, J, *batch))
-        changes = np.zeros((3, 2, J, *batch))  # of force and moment, by the joints from j on
-        for j in range(J - 1, 0, -1):
-            first, second = _OTHERS[axes[j]]
-            for part, vector in enumerate(self._wrenches[j]):
-                np.negative(vector[second], out=changes[first, part, j])
-                changes[second, part, j] = vector[first]
-            changes[:, :, j:] = posture.into_parent(j, list(changes[:, :, j:]))
-            force, moment = changes[:, 0, j:], changes[:, 1, j:]
-            for k, own in posture.chains.offset[j]:
+    def _take_across(self, j: int, vectors: Array) -> Array:
+        """Moments about the anchor of joint j, now in the frame of the link before, about that link's, (3, V, ...)."""
+        if self._has_wrench:
+            force, moment = vectors[:, _FORCE], vectors[:, _MOMENT]
+            for k, own in self._posture.chains.offset[j]:  # d × f
                 first, second = _OTHERS[k]
                 moment[first] -= own * force[second]
                 moment[second] += own * force[first]
-            np.negative(moment[axes[j - 1]], out=gradient[j - 1, j:])
-        return gradient.transpose(*range(2, gradient.ndim), 0, 1)
+        return vectors
 
 
 def _parts(vectors: Array) -> list[Part]:
     """Vectors of all joints of all legs, (..., L, J, 3), joint by joint."""
     by_joint = vectors.transpose(-2, -1, *range(vectors.ndim - 2))
     return [[(k, component) for k, component in enumerate(vector) if component.any()] for vector in by_joint]
-
-
-def _joints_last(array: Array) -> Array:
-    """(J, ..., L) to (..., L, J)."""
-    return array.transpose(*range(1, array.ndim), 0)
 
 
 def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:

@@ -12,7 +12,7 @@ from scipy import linalg
 from elastic_env.rigid_body import FloatingBody
 from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
-from elastic_env.walking.leg_chains import LegWeights
+from elastic_env.walking.leg_chains import LegLoads
 from elastic_env.walking.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
 
 _DOF = 6
@@ -32,7 +32,7 @@ def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
     """
     q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
     legs, carried = biped.chains.posture(q.reshape(2, -1)), np.full(2, biped.chains.mass / 2.0)
-    torque = LegWeights(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3))).torque().ravel()
+    torque = LegLoads(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3))).torque().ravel()
     theta = q + torque / stiffness
 
     def potential(x: Array) -> Array:

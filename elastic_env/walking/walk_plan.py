@@ -16,7 +16,7 @@ from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import contact_points, load_share, shares
 from elastic_env.walking.gait import RIGHT, Gait, Timing, step_timing, support_points, zmp_reference
-from elastic_env.walking.leg_chains import FootWrenches
+from elastic_env.walking.leg_chains import LegLoads
 from elastic_env.walking.preview_control import PreviewConfig, follow_zmp
 
 _COM_TOLERANCE_M = 1e-10
@@ -222,7 +222,7 @@ def _joint_torque(biped: Biped, ankles: Array, q: Array, dynamics: _Dynamics, sh
     arms = points - ankles
     legs = biped.chains.posture(q.reshape(len(q), 2, -1))
     # soles and pelvis are level: the feet's frames are parallel to the world's
-    contact = FootWrenches(legs, forces, np.cross(arms, forces) + moments)
+    contact = LegLoads(legs, wrench=(forces, np.cross(arms, forces) + moments))
     return dynamics.torque + contact.torque().reshape(len(q), -1)
 
 
