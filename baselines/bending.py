@@ -18,7 +18,7 @@ import numpy as np
 from baselines.compensators import GravityCompensator
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array, BoolArray
-from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+from elastic_env.walking.leg_kinematics import rotation_of_tilt
 
 LOADED_SHARE = 0.15
 """Share of the weight from which a foot counts as flat on the ground."""
@@ -106,7 +106,7 @@ class BendingObserver:
         for j in range(len(chains.axis) - 1, -1, -1):
             posture.into_parent(j, vectors, out=vectors)
             turn[chains.axis[j]] += bent[j]
-        R = (rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])).swapaxes(-1, -2)
+        R = rotation_of_tilt(attitude).swapaxes(-1, -2)
         up, expected = (np.moveaxis(vector, 0, -1) @ R for vector in pair)
         return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
 

@@ -10,7 +10,8 @@ from typing import Literal, Protocol, get_args
 
 import numpy as np
 
-from baselines.gravity_torque import GravityMethod, GravityModel, LegGravity, make_dynamics, make_gravity, make_load
+from baselines.contact_torque import LegTorque
+from baselines.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
 from elastic_env.elasticity import solve_stiffness, static_deflection, static_link_angle
 from elastic_env.errors import unknown_name
 from elastic_env.robots.robot_model import RobotModel
@@ -271,7 +272,7 @@ class DynamicCompensator:
 def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:
     """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg where the legs do not couple, (..., n) [rad]."""
     K = np.broadcast_to(stiffness, q.shape)
-    if not isinstance(gravity, LegGravity):
+    if not isinstance(gravity, LegTorque):
         return solve_stiffness(K, gravity.gravity_gradient(q), torque)
     blocks = gravity.gradient_by_leg(q)
     by_leg = blocks.shape[:-1]

@@ -35,6 +35,38 @@ def gravity_in_pelvis(attitude: Array, gravity: float) -> Array:
     return -gravity * np.stack(down, axis=-1)
 
 
+class LegTorque:
+    """Torques of legs under loads that go with any posture; a `GravityModel` on (num_worlds, 12).
+
+    Args:
+        chains: The legs.
+        loads: What loads them in a posture.
+    """
+
+    def __init__(self, chains: LegChains, loads: Callable[[LegPosture], LegLoads]) -> None:
+        self._chains, self._loads = chains, loads
+        self._last: tuple[Array, LegLoads] | None = None
+
+    def gravity_torque(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        return self._at(q).torque().reshape(q.shape)
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """See `GravityModel`; not symmetric under a wrench, which turns with its foot."""
+        return _block_diagonal(self.gradient_by_leg(q))
+
+    def gradient_by_leg(self, q: Array) -> Array:
+        """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
+        return self._at(q).gradient()
+
+    def _at(self, q: Array) -> LegLoads:
+        """At joint angles; torque and gradient are asked for at the same ones."""
+        if self._last is None or self._last[0] is not q:
+            posture = self._chains.posture(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
+            self._last = q, self._loads(posture)
+        return self._last[1]
+
+
 class ContactGravity:
     """Gravity torque of a walker under the planned load share, by one of the methods of the module.
 
@@ -50,7 +82,7 @@ class ContactGravity:
         self._attitude = table.group("imu_attitude")
         self._down = np.array([0.0, 0.0, -biped.gravity])
 
-    def at(self, rows: Array, level: bool = True) -> "BoundContactGravity":
+    def at(self, rows: Array, level: bool = True) -> LegTorque:
         """The gravity torque under the load share of observations, (num_worlds, m).
 
         Args:
@@ -65,28 +97,9 @@ class ContactGravity:
             in_sole[..., :2] = rest[:, None]
             in_sole[..., 2] = -biped.ankle_height
         gravity = self._down if level else gravity_in_pelvis(rows[:, self._attitude], biped.gravity)
-        return BoundContactGravity(self._model, weights, in_sole, gravity, self._method != "lumped")
-
-
-class BoundContactGravity:
-    """Gravity torque of a walker whose feet share the weight in a given way; a `GravityModel` on (num_worlds, 12)."""
-
-    def __init__(self, model: WalkerModel, weights: Array, in_sole: Array, gravity: Array, legs_weigh: bool) -> None:
-        chains = model.biped.chains
-        lifted = -chains.mass * weights  # what the ground carries is a negative mass where it does
-        self._legs = _Memo(chains, lambda legs: LegLoads(legs, gravity, lifted, in_sole, legs_weigh=legs_weigh))
-
-    def gravity_torque(self, q: Array) -> Array:
-        """See `GravityModel`."""
-        return self._legs.at(q).torque().reshape(q.shape)
-
-    def gravity_gradient(self, q: Array) -> Array:
-        """See `GravityModel`."""
-        return _block_diagonal(self.gradient_by_leg(q))
-
-    def gradient_by_leg(self, q: Array) -> Array:
-        """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        return self._legs.at(q).gradient()
+        lifted = -biped.chains.mass * weights  # what the ground carries is a negative mass where it does
+        legs_weigh = self._method != "lumped"
+        return LegTorque(biped.chains, lambda legs: LegLoads(legs, gravity, lifted, in_sole, legs_weigh=legs_weigh))
 
 
 class WrenchTorque:
@@ -101,33 +114,14 @@ class WrenchTorque:
         table = model.observation_table
         self._wrench, self._attitude = table.group("wrench"), table.group("imu_attitude")
 
-    def at(self, rows: Array, level: bool = False) -> "BoundWrenchTorque":
+    def at(self, rows: Array, level: bool = False) -> LegTorque:
         """The torque under the wrenches of observations, (num_worlds, m); `level` as in `ContactGravity.at`."""
-        gravity = self._model.biped.gravity
+        biped = self._model.biped
         attitude = np.zeros((len(rows), 2)) if level else rows[:, self._attitude]
+        gravity = gravity_in_pelvis(attitude, biped.gravity)
         wrench = rows[:, self._wrench].reshape(-1, _LEGS, 2, 3)
-        return BoundWrenchTorque(self._model, wrench, gravity_in_pelvis(attitude, gravity))
-
-
-class BoundWrenchTorque:
-    """Joint torques under wrenches that are known in the frames of the feet; a `GravityModel` on (num_worlds, 12)."""
-
-    def __init__(self, model: WalkerModel, wrench: Array, gravity: Array) -> None:
         force, moment = wrench[..., 0, :], wrench[..., 1, :]
-        chains = model.biped.chains_above_feet
-        self._legs = _Memo(chains, lambda legs: LegLoads(legs, gravity, wrench=(force, moment)))
-
-    def gravity_torque(self, q: Array) -> Array:
-        """See `GravityModel`."""
-        return self._legs.at(q).torque().reshape(q.shape)
-
-    def gravity_gradient(self, q: Array) -> Array:
-        """See `GravityModel`; not symmetric, since the wrench turns with its foot."""
-        return _block_diagonal(self.gradient_by_leg(q))
-
-    def gradient_by_leg(self, q: Array) -> Array:
-        """∂τ/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        return self._legs.at(q).gradient()
+        return LegTorque(biped.chains_above_feet, lambda legs: LegLoads(legs, gravity, wrench=(force, moment)))
 
 
 class PlannedTorque:
@@ -157,28 +151,13 @@ class BoundPlannedTorque:
 
     torque: Array
     q_ref: Array
-    gravity: BoundContactGravity
+    gravity: LegTorque
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  the interface's
         """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
         if np.array_equal(q, self.q_ref):
             return self.torque
         return self.torque + self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
-
-
-class _Memo:
-    """Loads of legs at the last joint angles: torque and gradient are asked for at the same ones."""
-
-    def __init__(self, chains: LegChains, make: Callable[[LegPosture], LegLoads]) -> None:
-        self._chains, self._make = chains, make
-        self._last: tuple[Array, LegLoads] | None = None
-
-    def at(self, q: Array) -> LegLoads:
-        """At joint angles, (num_worlds, 12) [rad]."""
-        if self._last is None or self._last[0] is not q:
-            posture = self._chains.posture(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
-            self._last = q, self._make(posture)
-        return self._last[1]
 
 
 def _block_diagonal(blocks: Array) -> Array:

@@ -4,7 +4,7 @@
 NumPy for a whole batch at once. Both agree to rounding.
 """
 
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, Protocol, get_args
 
 import mujoco
 import numpy as np
@@ -29,15 +29,6 @@ class GravityModel(Protocol):
 
     def gravity_gradient(self, q: Array) -> Array:
         """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
-        ...
-
-
-@runtime_checkable
-class LegGravity(GravityModel, Protocol):
-    """A gravity torque whose gradient has one block per leg."""
-
-    def gradient_by_leg(self, q: Array) -> Array:
-        """∂τ_g/∂q of each leg, (..., n) [rad] to (..., legs, n / legs, n / legs) [N·m/rad]."""
         ...
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
-from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+from elastic_env.walking.leg_kinematics import rotation_of_tilt
 
 LOADED_SHARE = 0.15
 """Share of the weight from which the feet count as loaded."""
@@ -79,7 +79,7 @@ class GroundLevel:
         over_ankles, velocity = self._center_of_mass(rows, force[..., 2])
         mean, number = self._mean(force.sum(axis=1), velocity, memory)
         lean = mean * self._certainty(number)[:, None]
-        R = rotation_y(lean[:, 1]) @ rotation_x(lean[:, 0])
+        R = rotation_of_tilt(lean)
         upright = force @ R.swapaxes(-1, -2)
         added = over_ankles * (upright - force)[..., :2]
         turned = moment + np.stack([-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1)

@@ -10,7 +10,7 @@ Control 112(1).
 
 import numpy as np
 
-from elastic_env.plan import quintic
+from elastic_env.plan import minimum_jerk
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.signals import Array, BoolArray
 from elastic_env.walking.sway import sway_frequencies
@@ -40,7 +40,7 @@ class Ramp:
         if self.is_over(steps).all():
             return np.ones_like(steps)
         time, each = steps * self._period_s, self._duration - self._delay
-        return 0.5 * (quintic(time / each)[0] + quintic((time - self._delay) / each)[0])
+        return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 
     def is_over(self, steps: Array) -> BoolArray:
         """Whether the compensation is complete."""

@@ -23,13 +23,13 @@ import numpy as np
 
 from baselines.policy import Action, ObservationView, resume
 from elastic_env.config import Model, quantity
-from elastic_env.plan import STAND_S, quintic
+from elastic_env.plan import STAND_S, minimum_jerk
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array, IntArray
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import shares
 from elastic_env.walking.gait import LEFT, RIGHT
-from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+from elastic_env.walking.leg_kinematics import rotation_of_tilt
 
 
 class WalkingGains(Model):
@@ -66,7 +66,7 @@ class LocalFrame:
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
     """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2) [rad]."""
     com, soles = biped.chains.com_and_feet(q.reshape(len(q), 2, -1), (0.0, 0.0, -biped.ankle_height))
-    R = rotation_y(attitude[:, 1]) @ rotation_x(attitude[:, 0])
+    R = rotation_of_tilt(attitude)
     return LocalFrame((R @ com[..., None])[..., 0], soles @ R.swapaxes(-1, -2))
 
 
@@ -117,7 +117,7 @@ class WalkingController:
         memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
         steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
         steps = steps + 1.0
-        share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else quintic(steps / self._ramp_steps)[0]
+        share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)
         row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
         z = self._leg_difference(rows, row, z)
         coms = frame.com_from_soles[..., :2]

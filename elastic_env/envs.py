@@ -176,18 +176,20 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         self, actions: Action
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
         """One control period in every world under command offsets, (num_envs, n) [rad]."""
-        restarting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
-        given = np.asarray(actions)
-        if restarting.any() and given.shape == self.action_space.shape:
+        restarting, given = self._done, np.asarray(actions)
+        some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
+        if some_restart and given.shape == self.action_space.shape:
             given = np.where(restarting[:, None], 0.0, given)
         result = self._worlds.step(given)
-        if restarting.any():
+        if some_restart:
             result = self._restarted_instead(result, restarting)
         self._done = done = result.done
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and done.any():
-            observation, info = self._restarted_after(result)
-        else:
-            observation, info = result.observation, _with_mask(result.info, done)
+        observation, info = result.observation, result.info
+        if done.any():
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                observation, info = self._restarted_after(result)
+            else:
+                info = _with_mask(info, done)
         return observation, result.reward, result.terminated, result.truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
@@ -256,9 +258,8 @@ def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> 
 
 
 def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
-    """Episode metrics with Gymnasium's mark of the worlds that have them, left out where no episode ends."""
-    if done.any():
-        info["_episode_metrics"] = done.copy()
+    """Episode metrics with Gymnasium's mark of the worlds that have them."""
+    info["_episode_metrics"] = done.copy()
     return info
 
 

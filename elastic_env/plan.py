@@ -43,11 +43,17 @@ class Extent:
     q_ddot: float
 
 
-def quintic(s: Array) -> tuple[Array, Array, Array]:
-    """Minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1 and its first two derivatives by s, s clipped to [0, 1]."""
+def minimum_jerk(s: Array) -> Array:
+    """Minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1, s clipped to [0, 1]."""
     s = np.clip(s, 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+def quintic(s: Array) -> tuple[Array, Array, Array]:
+    """`minimum_jerk` and its first two derivatives by s, s clipped to [0, 1]."""
+    blend, s = minimum_jerk(s), np.clip(s, 0.0, 1.0)
     return (
-        s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+        blend,
         30.0 * s**2 * (1.0 - s) ** 2,
         60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
     )

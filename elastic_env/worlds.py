@@ -136,23 +136,27 @@ class Worlds:
         self._metrics.update(signals, {name: mask.reshape(shape) for name, mask in masks.items()})
 
     def _checked(self, action: npt.ArrayLike) -> Array:
-        shape = (self.num_worlds, len(self._bound))
-        bounds = f"within ±{self._bound.max():g} rad"
         given = np.asarray(action)
+        if given.dtype.kind not in "fiub" or given.shape != (self.num_worlds, len(self._bound)):
+            raise self._refused(given)
+        values = given.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise self._refused(values)
+        return values
+
+    def _refused(self, given: npt.NDArray[Any]) -> ActionError:
+        """What is wrong with an action."""
+        shape, bounds = (self.num_worlds, len(self._bound)), f"within ±{self._bound.max():g} rad"
         if given.dtype.kind not in "fiub":
-            raise ActionError(f"an action must be real numbers, {bounds}, got an array of {given.dtype}")
+            return ActionError(f"an action must be real numbers, {bounds}, got an array of {given.dtype}")
         if given.shape != shape:
             # a scalar environment adds the axis of worlds itself
             expected, found = (shape[1:], given.shape[1:]) if self._is_scalar else (shape, given.shape)
-            raise ActionError(f"an action must have shape {expected} [rad], {bounds}; got shape {found}")
-        values = given.astype(np.float64)
-        if not np.isfinite(values).all():
-            worlds = np.flatnonzero(~np.isfinite(values).all(axis=1))
-            raise ActionError(
-                f"an action must be finite, {bounds}, shape {shape[1:]} a world; "
-                f"got {values[worlds[0]]} in world {worlds[0]}"
-            )
-        return values
+            return ActionError(f"an action must have shape {expected} [rad], {bounds}; got shape {found}")
+        world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
+        return ActionError(
+            f"an action must be finite, {bounds}, shape {shape[1:]} a world; got {given[world]} in world {world}"
+        )
 
 
 def _reasons(failures: dict[str, BoolArray], num_worlds: int) -> npt.NDArray[np.str_]:

@@ -15,7 +15,7 @@ from elastic_env.hardware.realtime import give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle, SupervisedBus
 from elastic_env.hardware.torque_line import torque_of_current
-from elastic_env.plan import QUINTIC_PEAK_RATE, quintic
+from elastic_env.plan import QUINTIC_PEAK_RATE, minimum_jerk
 from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.signals import Array, BoolArray
 
@@ -194,7 +194,7 @@ class ServoPlant:
     def _move(self, start: float, end: float) -> None:
         duration = max(QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S)
         steps = int(np.ceil(duration / self._period_s))
-        for share in quintic(np.arange(1, steps + 1) / steps)[0]:
+        for share in minimum_jerk(np.arange(1, steps + 1) / steps):
             self._cycle(start + (end - start) * float(share))
 
     def _cycles(self, angle: float, duration_s: float) -> None:

@@ -118,6 +118,7 @@ class WalkTask:
         """Control steps of an episode."""
         self._count(np.zeros(n, dtype=np.int64))
         self._reference, self._phases = _reference_rows(self.plan), _phase_rows(self.plan)
+        self._half_of_swing, self._swing_foot = _halves_of_swing(self.plan), RIGHT - self.plan.timing.support
         self._reference.flags.writeable = self._phases.flags.writeable = False
         self._draw = np.zeros(n, dtype=np.int64)
         self._stiffness, self._damping = np.tile(self._true_model.stiffness, (n, 1)), self._true_model.damping
@@ -128,7 +129,7 @@ class WalkTask:
         self._state = WalkState.zeros(n)
         self._measured = self._shown = WalkMeasurement.zeros(n)
         self._offset, self._offset_before, self._command = np.zeros((3, n, m))
-        self._contact_since = np.full(n, -1, dtype=np.int64)
+        self._contact_since, self._each = np.full(n, -1, dtype=np.int64), np.arange(n)
         self._fallen = np.zeros(n, dtype=np.bool_)
         self._noise_spread = _noise_spread(config.scenario)
         self._imu_is_due_always = config.scenario.pelvis_imu.rate_hz * config.control_period_s >= 1.0
@@ -356,14 +357,11 @@ class WalkTask:
 
     def _watch_swing_foot(self) -> None:
         """Since when the swing foot has been on the ground in the second half of its swing."""
-        row, timing = self._now, self.plan.timing
-        single, swing = timing.single[row], timing.swing[row]
-        swing_foot = RIGHT - timing.support[row]
-        loaded = self._state.force[np.arange(self.num_worlds), swing_foot] > UNLOADED_SHARE * self._weight
-        late = swing > 0.5
-        first = single & late & loaded & (self._contact_since < 0)
+        half, foot = self._half_of_swing.take(self._now), self._swing_foot.take(self._now)
+        loaded = self._state.force[self._each, foot] > UNLOADED_SHARE * self._weight
+        first = (half == SECOND_HALF) & loaded & (self._contact_since < 0)
         since = np.where(first, self._step, self._contact_since)
-        self._contact_since = np.where(single & ~late, -1, since)
+        self._contact_since = np.where(half == FIRST_HALF, -1, since)
 
     def _earliness(self, sample: WalkSample) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
@@ -388,6 +386,12 @@ def _phase_rows(plan: WalkPlan) -> BoolArray:
     )
 
 
+def _halves_of_swing(plan: WalkPlan) -> IntArray:
+    """Which half of a swing a control step is in, 0 for none."""
+    timing = plan.timing
+    return np.where(timing.single, np.where(timing.swing > 0.5, SECOND_HALF, FIRST_HALF), 0)
+
+
 def _noise_spread(scenario: Scenario) -> Array:
     """Standard deviations of gyroscope and foot sensors, (17,); the attitude sensor scales its noise itself."""
     wrench = [scenario.force_noise_n] * 3 + [scenario.moment_noise_nm] * 3
@@ -406,6 +410,8 @@ _DERIVED = ("sensordata", "site_xpos", "site_xmat", "actuator_force")
 _NOISE_WIDTH = 2 + 3 + 12
 TOUCHDOWN = -1
 """Row of the touch-downs among the phases."""
+FIRST_HALF, SECOND_HALF = 1, 2
+"""Of a swing."""
 
 
 def _num_substeps(config: WalkConfig) -> int:

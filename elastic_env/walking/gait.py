@@ -12,7 +12,7 @@ from pydantic import model_validator
 
 from elastic_env.config import Model, plain_numbers, quantity
 from elastic_env.errors import ConfigurationError
-from elastic_env.plan import STAND_S, control_times, quintic
+from elastic_env.plan import STAND_S, control_times, minimum_jerk
 from elastic_env.signals import Array, BoolArray, IntArray
 
 LEFT, RIGHT = 0, 1
@@ -157,7 +157,7 @@ def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
     zmp = np.repeat(middle[None], len(timing.time), axis=0)
     for begin, duration, start, target in _shifts(gait, supports, middle):
         progress = (timing.time - begin) / duration
-        blend = quintic(progress)[0] if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
+        blend = minimum_jerk(progress) if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
         zmp += blend[:, None] * (target - start)
     return zmp
 

@@ -93,6 +93,17 @@ def rotation_z(angle: Array) -> Array:
     return _rotation(angle, 0, 1)
 
 
+def rotation_of_tilt(attitude: Array) -> Array:
+    """Rotation about x by a roll, then about y by a pitch, (..., 2) [rad] to (..., 3, 3)."""
+    sine, cosine = np.sin(attitude), np.cos(attitude)
+    R = np.zeros((*attitude.shape[:-1], 3, 3))
+    R[..., 0, 0], R[..., 2, 0] = cosine[..., 1], -sine[..., 1]
+    R[..., 1, 1], R[..., 1, 2] = cosine[..., 0], -sine[..., 0]
+    R[..., 0, 1], R[..., 0, 2] = sine[..., 1] * sine[..., 0], sine[..., 1] * cosine[..., 0]
+    R[..., 2, 1], R[..., 2, 2] = cosine[..., 1] * sine[..., 0], cosine[..., 1] * cosine[..., 0]
+    return R
+
+
 def _rotation(angle: Array, first: int, second: int) -> Array:
     """Rotation that turns axis `first` towards axis `second`."""
     angle = np.asarray(angle, dtype=np.float64)
