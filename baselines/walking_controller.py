@@ -115,7 +115,7 @@ class WalkingController:
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        steps, z, last, velocity, shift = np.split(memory, [1, 2, 6, 8], axis=1)
+        steps, z, last, velocity, shift = memory[:, :1], memory[:, 1:2], memory[:, 2:6], memory[:, 6:8], memory[:, 8:]
         steps = steps + 1.0
         share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)
         row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)

@@ -36,8 +36,8 @@ class Transition:
         return self.terminated | self.truncated
 
 
-_SCORED_AT_ONCE = 16
-"""Control steps whose signals are computed together."""
+_SCORED_ROWS, _FEWEST_STEPS, _MOST_STEPS = 4096, 16, 64
+"""Rows (steps of all worlds) whose signals are computed together, and how many steps that can be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +68,7 @@ class Worlds:
         self._bound = task.action_table.space(np.float32).high.astype(np.float64)
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
         self._samples: list[_Sample] = []
+        self._scored_at_once = min(max(_SCORED_ROWS // task.num_worlds, _FEWEST_STEPS), _MOST_STEPS)
         self._no_reason = _reasons({}, task.num_worlds)
         self._no_reason.flags.writeable = False
 
@@ -112,7 +113,7 @@ class Worlds:
             self.score_samples()
             failed = {name: mask.copy() for name, mask in failures.items()}
             info["episode_metrics"] = {**self._metrics.values(), **failed}
-        elif len(self._samples) >= _SCORED_AT_ONCE:
+        elif len(self._samples) >= self._scored_at_once:
             self.score_samples()
         reward = functools.reduce(np.add, terms.values())
         return Transition(self.task.observe(), reward, terminated, truncated, info)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from elastic_env.errors import ElasticError
-from elastic_env.walking.leg_kinematics import LegGeometry, foot_pose, leg_angles
+from elastic_env.walking.leg_kinematics import LegGeometry, foot_pose, leg_angles, rotation_of_tilt
 
 LEG = LegGeometry(thigh=0.3, shank=0.28)
 CHAIN = """<mujoco><compiler angle="radian"/><worldbody><body name="hip">
@@ -47,6 +47,20 @@ def test_a_batch_of_any_shape_is_its_rows() -> None:
     angles = leg_angles(LEG, *foot_pose(LEG, q))
     assert angles.shape == (3, 4, 6)
     np.testing.assert_allclose(angles[1, 2], leg_angles(LEG, *foot_pose(LEG, q[1, 2])), rtol=0.0, atol=1e-12)
+
+
+def test_a_tilt_is_a_roll_and_then_a_pitch_as_mujoco_turns() -> None:
+    """Catches the other order, a sign, and the inverse."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint axis="0 1 0"/><joint axis="1 0 0"/><geom size="0.01"/></body></worldbody></mujoco>'
+    )
+    data = mujoco.MjData(model)
+    attitude = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 2))
+    R = rotation_of_tilt(attitude)
+    for row, (roll, pitch) in enumerate(attitude):
+        data.qpos[:] = pitch, roll
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(R[row].ravel(), data.xmat[1], rtol=0.0, atol=1e-14)
 
 
 @pytest.mark.parametrize("distance", [0.5801, 0.0199])

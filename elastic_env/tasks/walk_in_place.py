@@ -101,7 +101,10 @@ class WalkTask:
         self._true_model = _true_model(config, self.plan)
         self.model = config.true_model()
         self._robot = robot
-        self._at = JointAddresses.of(self.model, LEG_JOINTS)
+        at = JointAddresses.of(self.model, LEG_JOINTS)
+        # motor sides, link sides, the pelvis
+        self._positions = np.concatenate([at.theta, at.q, np.arange(7)])
+        self._velocities = np.concatenate([at.theta_dot, at.q_dot, np.arange(3, 6)])
         self._bank = robot_bank(config.scenario, config.bank)
         self._springs = spring_ids(self.model) if config.form == "tendon" else None
         feet = [self.model.body(f"{side}_foot").id for side in SIDES]
@@ -132,7 +135,9 @@ class WalkTask:
         self._contact_since, self._each = np.full(n, -1, dtype=np.int64), np.arange(n)
         self._fallen = np.zeros(n, dtype=np.bool_)
         self._noise_spread = _noise_spread(config.scenario)
-        self._imu_is_due_always = config.scenario.pelvis_imu.rate_hz * config.control_period_s >= 1.0
+        steps, imu = np.arange(self.num_steps + 1), config.scenario.pelvis_imu
+        self._imu_is_due = is_due(steps, imu.rate_hz, config.control_period_s)
+        self._imu_is_due_always = bool(self._imu_is_due.all())
 
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place robots in static equilibrium under zero offset."""
@@ -177,7 +182,8 @@ class WalkTask:
 
     def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
         """Read the new state, then what the sensors show of it."""
-        self._count(self._step + 1)
+        self._step, self._now = self._step + 1, self._next
+        self._next = self._row(self._step + 1)
         self._read(simulation, healthy)
         before, self._measured = self._measured, self._measure(healthy)
         self._shown = before if self.config.scenario.delay_steps else self._measured
@@ -252,7 +258,7 @@ class WalkTask:
     def reward_terms(self, sample: WalkSample, diverged: BoolArray) -> dict[str, Array]:
         """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
         weights, state = self.config.reward, sample.state
-        deviation = state.zmp - self._zmp_reference
+        deviation = state.zmp - self.plan.zmp.take(self._now, axis=0)
         return {
             "tilt": weights.tilt * tilt_penalty(state.attitude[:, 2]),
             "zmp": weights.zmp * zmp_penalty(np.hypot(deviation[:, 0], deviation[:, 1])),
@@ -281,7 +287,6 @@ class WalkTask:
 
     def _count(self, step: IntArray) -> None:
         self._step, self._now, self._next = step, self._row(step), self._row(step + 1)
-        self._zmp_reference = self.plan.zmp[self._now]
 
     def _command_rate(self, sample: WalkSample) -> Array:
         """Rate of change of the offsets, rms over the joints [rad/s]."""
@@ -314,27 +319,29 @@ class WalkTask:
 
     def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
         """The true state of some worlds; the others keep their last one."""
-        at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
+        # take, not an index: the memory order of its result does not depend on the number of worlds
+        position, velocity = (
+            simulation.qpos.take(self._positions, axis=1),
+            simulation.qvel.take(self._velocities, axis=1),
+        )
+        m = len(LEG_JOINTS)
+        pelvis, quaternion = position[:, 2 * m : 2 * m + 3], position[:, 2 * m + 3 :]
         wrench = -simulation.bind("sensordata")  # MuJoCo's act on the foot, ours on the leg
         foot_R = simulation.bind("site_xmat").take(self._sites, axis=1).reshape(-1, 2, 3, 3)
         ankles = simulation.bind("site_xpos").take(self._sites, axis=1)
         force, moment = self._foot_sensors.ground_wrench(wrench.reshape(-1, 2, 2, 3), foot_R)
         fresh = WalkState(
-            # take, not an index: the memory order of its result does not depend on the number of worlds
-            theta=qpos.take(at.theta, axis=1),
-            theta_dot=qvel.take(at.theta_dot, axis=1),
-            q=qpos.take(at.q, axis=1),
-            q_dot=qvel.take(at.q_dot, axis=1),
-            pelvis=qpos[:, :3].copy(),
-            quaternion=qpos[:, 3:7].copy(),
-            attitude=attitude_of(qpos[:, 3:7]),
-            rate=qvel[:, 3:6].copy(),
+            theta=position[:, :m], theta_dot=velocity[:, :m],
+            q=position[:, m : 2 * m], q_dot=velocity[:, m : 2 * m],
+            pelvis=pelvis, quaternion=quaternion,
+            attitude=attitude_of(quaternion),
+            rate=velocity[:, 2 * m :],
             ankles=ankles,
             wrench=wrench,
             force=force[..., 2],
             zmp=zero_moment_point(force, moment, ankles, self._least_force),
             servo_torque=simulation.bind("actuator_force").copy(),
-        )
+        )  # fmt: skip
         self._state = fresh if worlds.all() else self._state.with_worlds(worlds, fresh)
         low = self._state.pelvis[:, 2] < FALL_HEIGHT_SHARE * self.config.gait.hip_height_m
         self._fallen = low | (self._state.attitude[:, 2] > FALL_TILT_RAD)
@@ -349,7 +356,7 @@ class WalkTask:
         body[:, RATE] += state.rate
         body[:, WRENCH] += state.wrench
         if not self._imu_is_due_always:
-            due = worlds & is_due(self._step, scenario.pelvis_imu.rate_hz, self.config.control_period_s)
+            due = worlds & self._imu_is_due.take(self._now)
             body[:, : WRENCH.start] = np.where(due[:, None], body[:, : WRENCH.start], last.body[:, : WRENCH.start])
         encoder = quantise(state.theta + self._encoder_bias, counts)
         fresh = WalkMeasurement(encoder, last.encoder, body)
