@@ -52,7 +52,8 @@ def test_a_batch_of_any_shape_is_its_rows() -> None:
 def test_a_tilt_is_a_roll_and_then_a_pitch_as_mujoco_turns() -> None:
     """Catches the other order, a sign, and the inverse."""
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><joint axis="0 1 0"/><joint axis="1 0 0"/><geom size="0.01"/></body></worldbody></mujoco>'
+        '<mujoco><worldbody><body><joint axis="0 1 0"/><joint axis="1 0 0"/><geom size="0.01"/></body></worldbody>'
+        "</mujoco>"
     )
     data = mujoco.MjData(model)
     attitude = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 2))
