@@ -69,12 +69,15 @@ def changes_table(rows: Sequence[Change]) -> Table:
         over = f"interquartile mean and 95 % interval over {'/'.join(map(str, seeds))} training seeds"
     marks = {mark for row in rows for mark in row.marks}
     signs = [f"{sign} {words}" for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in marks)]
+    policies = list(dict.fromkeys(row.policy for row in rows))
+    named = ["residual"] if len(policies) > 1 else []  # else the title names it, which leaves room
+    whose = "" if named else f"{escape(policies[0])}: "
     table = Table(
-        title=f"change against the base on the same episodes, {over}",
+        title=f"{whose}change against the base on the same episodes, {over}",
         caption=", ".join([*signs, "* no interval, or one that includes zero: no difference shown"]),
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
     )  # fmt: skip
-    for name in ("residual", "reference", "scenario", *swept):
+    for name in (*named, "reference", "scenario", *swept):
         table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold")
     for column in columns:
         table.add_column(column.title, justify="right", no_wrap=True, vertical="bottom")
@@ -85,7 +88,7 @@ def changes_table(rows: Sequence[Change]) -> Table:
         if previous and previous[0] != first.policy:
             table.add_section()
         names = (first.policy, first.reference)
-        shown = ("", "") if names == previous else names
+        shown = ("",) * (1 + len(named)) if names == previous else names[1 - len(named) :]
         previous = names
         values = {row.column: row for row in line}
         table.add_row(

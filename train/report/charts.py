@@ -125,7 +125,7 @@ def forest(rows: Sequence[Change]) -> Chart:
             }
         )  # fmt: skip
         layout[f"xaxis{axis}"] = axis_of(
-            range=[low - 0.05 * span, high + 0.42 * span], domain=domain(number, len(columns), 0.03), anchor="y",
+            range=[low - 0.05 * span, high + 0.5 * span], domain=domain(number, len(columns), 0.03), anchor="y",
             side="top", title=f"change of {column.title} [%]", zeroline=True, zerolinecolor=INK, zerolinewidth=1.2,
         )  # fmt: skip
     layout["yaxis"] = axis_of(
