@@ -86,6 +86,10 @@ class BendingObserver:
         theta = rows[:, self._theta]
         return theta - self._compensator.at(rows).link_angle(theta, theta)
 
+    def expected_tilt(self, rows: Array) -> Array:
+        """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds, 2 legs, 2) [rad]."""
+        return self.disagreement(rows, self.bending(rows))[1]
+
     def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
         """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a foot that is flat.
 

@@ -175,8 +175,8 @@ class _ContactError:
         return self._level.begin(num_worlds)
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        level, memory = self._level.observe(rows, memory)
-        wrench = level[:, 2:].reshape(-1, 2, 2, 3)
+        _, wrenches, memory = self._level.upright(rows, memory)
+        wrench = wrenches.reshape(-1, 2, 2, 3)
         force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
         zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
         vertical = force[:, :, 2].sum(axis=1)

@@ -9,14 +9,22 @@ bend:
 as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in that of the pelvis, which is parallel to
 them but for what the joints bend. The mean of the acceleration over a time t is a difference of velocities, known from
 the motors to some σ_v, so that with σ_λ before any measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The
-attitude less this tilt is one that the robot made itself. The weight leans too, and acts at the center of mass, h over
-the ankles: set upright, it leaves the ankles with the wrenches of level ground,
+weight leans too, and acts at the center of mass, h over the ankles: set upright, it leaves the ankles with the wrenches
+of level ground,
 
 .. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
+
+A weight that leans bends the legs further than one that is upright, s and s' by the model (`baselines.bending`), each
+leg by its share w of the load. Level ground would not show that either, so that what the robot tilts by itself is
+
+.. math:: \text{attitude} - \lambda - \sum_{legs} w (s - s')
+
+On two feet that is too much about x, where a leaning weight goes from one foot to the other rather than to the ankles.
 """
 
 import numpy as np
 
+from baselines.bending import BendingObserver
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
 from elastic_env.walking.leg_kinematics import rotation_of_tilt
@@ -55,7 +63,7 @@ class GroundLevel:
         table = model.observation_table
         self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
         self._theta, self._rate = table.group("encoder_angle"), table.group("encoder_rate")
-        self._carried = model.biped.chains_above_feet
+        self._carried, self._bending = model.biped.chains_above_feet, BendingObserver(model)
         self._least_n = LOADED_SHARE * model.biped.weight
         self._period_s, self._gravity = period_s, model.biped.gravity
         self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
@@ -73,6 +81,18 @@ class GroundLevel:
             rows: Observations, (num_worlds, m).
             memory: (num_worlds, memory_width).
         """
+        lean, wrenches, memory = self.upright(rows, memory)
+        level = rows.copy()
+        level[:, self._attitude] -= lean
+        level[:, self._wrench] = wrenches
+        load = np.maximum(rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2], 0.0)
+        share = load / np.maximum(load.sum(axis=1, keepdims=True), self._least_n)
+        further = self._bending.expected_tilt(rows) - self._bending.expected_tilt(level)
+        own = level[:, self._attitude] - (share[..., None] * further).sum(axis=1)
+        return np.hstack([own, wrenches]), memory
+
+    def upright(self, rows: Array, memory: Array) -> tuple[Array, Array, Array]:
+        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12), and the new memory."""
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
         force, moment = wrench[:, :, 0], wrench[:, :, 1]
@@ -83,8 +103,8 @@ class GroundLevel:
         upright = force @ R.swapaxes(-1, -2)
         added = over_ankles * (upright - force)[..., :2]
         turned = moment + np.stack([-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1)
-        level = np.stack([upright, turned], axis=2).reshape(n, -1)
-        return np.hstack([rows[:, self._attitude] - lean, level]), np.column_stack([number, mean, velocity])
+        wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
+        return lean, wrenches, np.column_stack([number, mean, velocity])
 
     def _certainty(self, number: Array) -> Array:
         """How much of the mean the estimate is, 0 to 1."""
