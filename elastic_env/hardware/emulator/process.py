@@ -29,7 +29,7 @@ from elastic_env.hardware.emulator.wire import EmulatedBus
 from elastic_env.hardware.realtime import prefer_realtime
 from elastic_env.sensors import attitude
 
-_PHYSICS_S, _LONGEST_PHYSICS_S = 1e-3, 5e-3  # between two advances: as a rule, and while replies go out
+_PHYSICS_S, _LONGEST_PHYSICS_S = 2e-3, 5e-3  # between two advances: as a rule, and while replies go out
 _PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at once, or what it has after that time
 _UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
@@ -94,7 +94,7 @@ class Emulator:
         self.imu_terminal = Terminal.opened()
         self.faults = config.faults
         # of the line and of the IMU: who asks for replies gets the same faults, whatever the time
-        self._line, self._imu = np.random.default_rng(config.seed).spawn(2)
+        self._line, self._imu = (np.random.default_rng([config.seed, stream]) for stream in range(2))
         self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
         self._servos = [
             EmulatedServo(servo_id, model, self._note, config.claimed_model_number, JointState())
