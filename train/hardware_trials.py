@@ -106,17 +106,15 @@ def loop(share: float) -> Trial:
     ids = tuple(range(1, 13))
     late: dict[str, list[float]] = {"bus": [], "sleep": []}
     missed = 0
-    with _beside_the_program(EmulatorConfig(ids=ids, faults=_USB_LATENCY)) as emulator:
-        prefer_realtime()
-        with SupervisedBus({emulator.port: ids}) as bus:
-            for _ in range(blocks):
-                late["sleep"] += _sleep_loop(block_s)
-                bus.enable(_PATIENT)
-                lateness, misses = _bus_loop(bus, len(ids), block_s)
-                late["bus"] += lateness
-                missed += misses
-                bus.disable()
-        give_up_realtime()
+    config = EmulatorConfig(ids=ids, faults=_USB_LATENCY)
+    with _beside_the_program(config) as emulator, SupervisedBus({emulator.port: ids}) as bus:
+        for _ in range(blocks):
+            late["sleep"] += _sleep_loop(block_s)
+            bus.enable(_PATIENT)
+            lateness, misses = _bus_loop(bus, len(ids), block_s)
+            late["bus"] += lateness
+            missed += misses
+            bus.disable()
     overruns = {name: [x for x in values if x > 0.5 * PERIOD_S] for name, values in late.items()}
     shares = {name: len(overruns[name]) / len(late[name]) for name in late}
     return Trial(
@@ -131,14 +129,19 @@ def loop(share: float) -> Trial:
 
 @contextlib.contextmanager
 def _beside_the_program(config: EmulatorConfig) -> Iterator[RunningEmulator]:
-    """An emulator with a core of its own, as servos have: Linux takes 5 % of a core from real-time processes."""
+    """An emulator with a core of its own, as servos have, and this program in real time on the others.
+
+    Linux takes 5 % of a core from real-time processes that fill it.
+    """
     cores = sorted(os.sched_getaffinity(0))
     try:
         os.sched_setaffinity(0, cores[-1:])  # which the emulator inherits
         with RunningEmulator(config) as emulator:
             os.sched_setaffinity(0, cores[:-1] or cores)
+            prefer_realtime()
             yield emulator
     finally:
+        give_up_realtime()
         os.sched_setaffinity(0, cores)
 
 

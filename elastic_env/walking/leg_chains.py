@@ -224,7 +224,8 @@ class LegLoads:
                 np.negative(carried[second, _FORCE:], out=change[first, _FORCE:])
                 change[second, _FORCE:] = carried[first, _FORCE:]
             if j > 0:
-                self._take_across(j, posture.into_parent(j, changes[:, :, j:], out=changes[:, :, j:]))
+                moved = changes[:, :, j:]
+                self._take_across(j, posture.into_parent(j, moved, out=moved))
         return gradient.transpose(*range(2, gradient.ndim), 0, 1)
 
     def _in_links(self, gravity: Array) -> Array:
