@@ -57,7 +57,7 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
 def test_a_servo_that_gets_torque_holds_where_it_is() -> None:
     """Catches a jump to an old goal when torque is switched on."""
     servo = make_servo()
-    servo.joint.position = 0.25
+    servo.motor.position = 0.25
     write(servo, "goal_position", 1000)
     write(servo, "torque_enable", 1)
     assert servo.goal == pytest.approx(0.25, abs=servo.model.position_unit)
@@ -167,10 +167,12 @@ def test_emulated_joint_is_the_testbeds_own() -> None:
     torque = config.true_pendulum.torque(joints.q)
     assert config.true_joint.stiffness * deflection[0] == pytest.approx(torque[0], rel=2e-3)
     assert torque[0] > 25.0
+    assert joints.motors[0].position == joints.theta[0]
+    assert joints.motors[0].torque == pytest.approx(torque[0], rel=0.1)
     assert joints.q[1] == 0.0
     joints.set_torque(0, is_on=False)
     joints.advance(4.9)
-    assert joints.motor_torque[0] == 0.0
+    assert joints.motors[0].torque == 0.0
 
 
 def test_emulator_that_cannot_be_is_refused() -> None:

@@ -46,7 +46,7 @@ class Register:
         except OverflowError:
             raise HardwareError(f"register {self.name!r} has {self.size} bytes, which {value} does not fit") from None
 
-    def decode(self, stored: bytes) -> int:
+    def decode(self, stored: bytes | bytearray) -> int:
         """The value of stored bytes."""
         return int.from_bytes(stored, "little", signed=self.is_signed)
 

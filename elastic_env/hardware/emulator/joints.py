@@ -1,5 +1,7 @@
 """The joints behind the emulated servos: the testbed's own plant in MuJoCo, one world per servo, in real time."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from elastic_env.errors import ConfigurationError
@@ -69,16 +71,37 @@ class Joints:
         return self._simulation.qpos[:, self._at.theta[0]]
 
     @property
-    def theta_dot(self) -> Array:
-        """Its rate, (num_joints,) [rad/s]."""
-        return self._simulation.qvel[:, self._at.theta_dot[0]]
-
-    @property
     def q(self) -> Array:
         """Link side, (num_joints,) [rad]."""
         return self._simulation.qpos[:, self._at.q[0]]
 
     @property
-    def motor_torque(self) -> Array:
-        """Torque of the servos, (num_joints,) [N·m]."""
-        return np.asarray(self._force)[:, 0]
+    def motors(self) -> list["MotorSide"]:
+        """What the servos measure, now and later."""
+        theta, theta_dot = self.theta, self._simulation.qvel[:, self._at.theta_dot[0]]
+        columns = theta, theta_dot, np.asarray(self._force)[:, 0]
+        return [MotorSide(*(column[i : i + 1] for column in columns)) for i in range(len(theta))]
+
+
+@dataclass(frozen=True)
+class MotorSide:
+    """Live views of one joint's motor side, (1,) each."""
+
+    theta: Array
+    theta_dot: Array
+    force: Array
+
+    @property
+    def position(self) -> float:
+        """Angle of the motor side [rad]."""
+        return float(self.theta[0])
+
+    @property
+    def velocity(self) -> float:
+        """Its rate [rad/s]."""
+        return float(self.theta_dot[0])
+
+    @property
+    def torque(self) -> float:
+        """Torque of the servo [N·m]."""
+        return float(self.force[0])

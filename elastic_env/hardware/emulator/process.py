@@ -14,6 +14,7 @@ import time
 import tty
 from collections import deque
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import changed, damage, flip_bit
 from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.mip import attitude_packet
-from elastic_env.hardware.emulator.servo import EmulatedServo, JointState
+from elastic_env.hardware.emulator.servo import EmulatedServo
 from elastic_env.hardware.emulator.wire import EmulatedBus
 from elastic_env.hardware.realtime import prefer_realtime
 from elastic_env.sensors import attitude
@@ -97,9 +98,10 @@ class Emulator:
         self._line, self._imu = (np.random.default_rng([config.seed, stream]) for stream in range(2))
         self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
         self._servos = [
-            EmulatedServo(servo_id, model, self._note, config.claimed_model_number, JointState())
-            for servo_id in config.ids
+            EmulatedServo(servo_id, model, partial(self._note, index), config.claimed_model_number, motor)
+            for index, (servo_id, motor) in enumerate(zip(config.ids, self._joints.motors, strict=True))
         ]
+        self._with_watchdog = self._servos if model.has_watchdog else []
         self._bus = EmulatedBus(self._servos)
         self._parser = protocol.Parser()
         self._replies: deque[tuple[float, bytes]] = deque()
@@ -114,19 +116,17 @@ class Emulator:
         has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
         if has_heard or not self._replies or self._joints.lag(now) > _LONGEST_PHYSICS_S:
             self._joints.advance(now)
-        if has_heard or any(servo.is_watched for servo in self._servos):
-            self._measure()
-        for servo in self._servos:
+        for servo in self._with_watchdog:
             servo.watch(now)
         if self.bus_terminal is not None and has_heard:
             heard = self.bus_terminal.read()
             if not self.bus_terminal.speaks(self.config.baudrate):
                 heard = b""  # noise
             for packet in self._parser.feed(heard):
+                self._queue(self._bus.answer(packet, now), now)
                 if packet.instruction == protocol.SYNC_READ:
                     for servo in self._servos:
                         self.events.append((now, servo.servo_id, "present_position", servo.present_position))
-                self._queue(self._bus.answer(packet, now), now)
         self._send_due(time.monotonic())
         self._send_attitude(now)
         return control in ready
@@ -176,21 +176,14 @@ class Emulator:
                 break
         return at
 
-    def _note(self, servo_id: int, name: str, value: int) -> None:
+    def _note(self, index: int, servo_id: int, name: str, value: int) -> None:
         self.events.append((time.monotonic(), servo_id, name, value))
-        index, servo = next((i, servo) for i, servo in enumerate(self._servos) if servo.servo_id == servo_id)
+        servo = self._servos[index]
         if name == "torque_enable":
             self._joints.set_torque(index, bool(value))
             self._joints.command(index, servo.goal)
         if name == "goal_position" and servo.is_on:
             self._joints.command(index, servo.goal)
-
-    def _measure(self) -> None:
-        values = (x.tolist() for x in (self._joints.theta, self._joints.theta_dot, self._joints.motor_torque))
-        for servo, theta, theta_dot, torque in zip(self._servos, *values, strict=True):
-            servo.joint.position, servo.joint.velocity = theta, theta_dot
-            servo.joint.torque = torque if servo.is_on else 0.0
-            servo.measure()
 
     def _queue(self, replies: list[bytes], now: float) -> None:
         for reply in replies:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from elastic_env.hardware import protocol
 from elastic_env.hardware.control_table import Register, ServoModel
@@ -17,16 +18,32 @@ _WATCHDOG_FIRED = -1
 Notify = Callable[[int, str, int], None]
 
 
+class Motor(Protocol):
+    """What a servo measures of its motor side, now."""
+
+    @property
+    def position(self) -> float:
+        """Angle [rad]."""
+        ...
+
+    @property
+    def velocity(self) -> float:
+        """Its rate [rad/s]."""
+        ...
+
+    @property
+    def torque(self) -> float:
+        """Torque of the servo [N·m]."""
+        ...
+
+
 @dataclass
-class JointState:
-    """What a servo measures of its motor side."""
+class MotorAtRest:
+    """A motor that nothing moves."""
 
     position: float = 0.0
-    """[rad]"""
     velocity: float = 0.0
-    """[rad/s]"""
     torque: float = 0.0
-    """[N·m]"""
 
 
 @dataclass
@@ -38,14 +55,14 @@ class EmulatedServo:
         model: Its type, by which its registers and units go.
         notify: Called with id, register and value when torque, goal or watchdog change.
         model_number: What it says that it is; another one than its type's to try out that case.
-        joint: What it measures.
+        motor: What it measures.
     """
 
     servo_id: int
     model: ServoModel
     notify: Notify
     model_number: int | None = None
-    joint: JointState = field(default_factory=JointState)
+    motor: Motor = field(default_factory=MotorAtRest)
     _memory: bytearray = field(init=False)
     _registered: tuple[int, bytes] | None = None
     _heard_s: float = 0.0
@@ -86,10 +103,10 @@ class EmulatedServo:
 
     def measure(self) -> None:
         """Put what it measures into its registers."""
-        model, joint = self.model, self.joint
-        self._set("present_position", round(joint.position / model.position_unit))
-        self._set("present_velocity", round(joint.velocity / model.velocity_unit))
-        self._set("present_current", round(current_of_torque(joint.torque) / model.current_unit))
+        model, motor = self.model, self.motor
+        self._set("present_position", round(motor.position / model.position_unit))
+        self._set("present_velocity", round(motor.velocity / model.velocity_unit))
+        self._set("present_current", round(current_of_torque(motor.torque) / model.current_unit))
 
     def overload(self, is_overloaded: bool) -> None:
         """Begin or end an overload: the status shows it, and the servo lets go (factory setting of shutdown)."""
@@ -103,6 +120,7 @@ class EmulatedServo:
         Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus Watchdog).
         """
         if self.is_watched and now_s - self._heard_s > self._get("bus_watchdog") * _WATCHDOG_UNIT_S:
+            self.measure()
             self._change("goal_position", self.present_position)
             self._change("bus_watchdog", _WATCHDOG_FIRED)
 
@@ -143,6 +161,7 @@ class EmulatedServo:
         """Error number and bytes; beyond the table there is nothing to read."""
         if address + length > len(self._memory) or length == 0:
             return protocol.ACCESS_ERROR | self._alert, b""
+        self.measure()
         return self._alert, bytes(self._memory[address : address + length])
 
     def write(self, address: int, data: bytes) -> int:
@@ -204,7 +223,7 @@ class EmulatedServo:
 
     def _get(self, name: str) -> int:
         register = self.model.table[name]
-        return register.decode(bytes(self._memory[register.address : register.end]))
+        return register.decode(self._memory[register.address : register.end])
 
     def _set(self, name: str, value: int) -> None:
         self._store(self.model.table[name], value)
