@@ -1,10 +1,12 @@
 """Limits by themselves; bus and supervisor through the real SDK on an emulated bus, in good times and bad."""
 
 import os
+import pty
 import signal
 import subprocess
 import sys
 import time
+import tty
 from collections.abc import Iterator
 
 import numpy as np
@@ -17,6 +19,7 @@ from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
+from elastic_env.hardware.port import Port
 from elastic_env.hardware.safety import Guard, SafetyLimits
 from elastic_env.hardware.supervised import SupervisedBus
 
@@ -173,6 +176,38 @@ def test_slow_adapter_is_refused_with_its_cure(emulator: RunningEmulator) -> Non
     emulator.faults(latency_s=0.016)
     with pytest.raises(HardwareError, match=r"round trip .* is 1[67].*latency timer to 1 ms"):
         SupervisedBus({emulator.port: [1]})
+
+
+def read_until(port: Port, number: int, at_once: int) -> list[bytes]:
+    """Pieces of together so many bytes, within a second."""
+    parts, end = [], time.monotonic() + 1.0
+    while sum(map(len, parts)) < number and time.monotonic() < end:
+        parts.append(port.readPort(at_once))
+    return parts
+
+
+def test_a_read_takes_no_more_than_it_asked_for_and_loses_nothing() -> None:
+    """Catches bytes read ahead that are lost, given twice, or still there after the port was cleared."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = Port(os.ttyname(slave))
+    port.open()
+    try:
+        os.write(master, bytes(range(30)))
+        parts = read_until(port, 30, at_once=11)
+        assert max(map(len, parts)) <= 11
+        assert b"".join(parts) == bytes(range(30))
+        assert port.readPort(1) == b""
+        os.write(master, b"old")
+        assert b"".join(read_until(port, 1, at_once=1)) == b"o"
+        time.sleep(0.01)
+        port.clearPort()
+        os.write(master, b"new")
+        assert b"".join(read_until(port, 3, at_once=3)) == b"new"
+    finally:
+        port.closePort()
+        os.close(master)
+        os.close(slave)
 
 
 def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator) -> None:

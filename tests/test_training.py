@@ -184,6 +184,10 @@ def test_a_state_of_something_else_is_refused() -> None:
     """Catches a checkpoint of one robot that is loaded into another."""
     with pytest.raises(ElasticError, match=r"checkpoint of TestbedTask cannot be restored into WalkTask"):
         restore(wrapped("walker", 2, base="input_output"), capture(wrapped("testbed", 2)))
+    older = capture(wrapped("testbed", 2))
+    older["attributes"]["renamed_since"] = 0
+    with pytest.raises(ElasticError, match=r"another version .* renamed_since; resume it with that version"):
+        restore(wrapped("testbed", 2), older)
 
 
 def test_a_mixture_is_its_parts() -> None:

@@ -54,6 +54,11 @@ def restore(value: Any, state: Any) -> Any:
     if isinstance(state, dict) and "object" in state:
         if type(value).__name__ != state["object"]:
             raise ElasticError(f"a checkpoint of {state['object']} cannot be restored into {type(value).__name__}")
+        if unknown := sorted(set(state["attributes"]) - set(vars(value))):
+            raise ElasticError(
+                f"the checkpoint is of another version of this software, its {state['object']} has "
+                f"{', '.join(unknown)}; resume it with that version (metadata.json tells the commit), or train anew"
+            )
         for name, part in state["attributes"].items():
             setattr(value, name, restore(getattr(value, name), part))
         return value

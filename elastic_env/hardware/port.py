@@ -6,6 +6,7 @@
 | unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` is `protocol.unstuff` |
 | every reply may take 34 ms before it counts as missing | `Port.reply_timeout_s` |
 | waiting for a reply is a busy loop | `Port` blocks in the read |
+| each reply is read in two pieces, by two calls of the system each | `Port.readPort` reads all that is there |
 | an interrupted read leaves the port "in use", and torque off is refused | `Port.release` |
 | an unplugged port raises SerialException, or OSError, or termios.error | `bus_gone` makes one error of them |
 | two programs can open one port and speak at the same time | `Port` locks it, see `port_lock` |
@@ -66,6 +67,7 @@ class Port(PortHandler):
         super().__init__(name)
         self.baudrate = baudrate
         self.reply_timeout_s = 0.05
+        self._read_ahead = b""
         self._lock: int | None = None
 
     def open(self) -> None:
@@ -94,6 +96,18 @@ class Port(PortHandler):
         self.tx_time_per_byte = 1e4 / self.baudrate
         return True
 
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Bytes that have come, at most so many; waits a short while for the first one."""
+        if len(self._read_ahead) < length:
+            self._read_ahead += self.ser.read(max(self.ser.in_waiting, 1))
+        taken, self._read_ahead = self._read_ahead[:length], self._read_ahead[length:]
+        return taken
+
+    def clearPort(self) -> None:  # noqa: N802
+        """Forget what has come."""
+        self._read_ahead = b""
+        super().clearPort()
+
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         """Time for a reply: the bytes on the wire, and `reply_timeout_s`."""
         self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + 1e3 * self.reply_timeout_s)
@@ -108,7 +122,7 @@ class Port(PortHandler):
 
     def closePort(self) -> None:  # noqa: N802
         """Close; a second time, or without having been open, does nothing."""
-        lock, self._lock = self._lock, None
+        lock, self._lock, self._read_ahead = self._lock, None, b""
         try:
             if self.ser is not None:
                 with bus_gone(self.port_name):

@@ -32,6 +32,7 @@ from elastic_env.sensors import attitude
 
 _PHYSICS_S, _LONGEST_PHYSICS_S = 2e-3, 5e-3  # between two advances: as a rule, and while replies go out
 _PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at once, or what it has after that time
+_SETTLE_S = 3e-4  # after a write, for the kernel to pass it on, which it does at a lower priority than ours
 _UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
@@ -105,7 +106,7 @@ class Emulator:
         self._bus = EmulatedBus(self._servos)
         self._parser = protocol.Parser()
         self._replies: deque[tuple[float, bytes]] = deque()
-        self._next_imu_s = self._start_s = time.monotonic()
+        self._next_imu_s = self._start_s = self._settled_s = time.monotonic()
 
     def step(self, wait_s: float, control: int | None = None) -> bool:
         """Wait for something to happen, and let it; whether the control channel has something to say."""
@@ -114,7 +115,8 @@ class Emulator:
         now = time.monotonic()
         self._send_due(now)  # replies wait for nothing
         has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
-        if has_heard or not self._replies or self._joints.lag(now) > _LONGEST_PHYSICS_S:
+        is_idle = not self._replies and now >= self._settled_s
+        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
             self._joints.advance(now)
         for servo in self._with_watchdog:
             servo.watch(now)
@@ -163,7 +165,8 @@ class Emulator:
 
     def _idle(self, wait_s: float) -> float:
         now = time.monotonic()
-        return max(min(now + min(wait_s, _PHYSICS_S), self._next_imu_s, self._next_packet_s()) - now, 0.0)
+        physics_s = self._settled_s if self._settled_s > now else now + _PHYSICS_S
+        return max(min(now + wait_s, physics_s, self._next_imu_s, self._next_packet_s()) - now, 0.0)
 
     def _next_packet_s(self) -> float:
         """When the adapter has enough replies to pass on, or has waited long enough."""
@@ -199,6 +202,7 @@ class Emulator:
             due += self._replies.popleft()[1]
         if due and self.bus_terminal is not None:
             self.bus_terminal.write(due)
+            self._settled_s = time.monotonic() + _SETTLE_S
 
     def _send_attitude(self, now: float) -> None:
         if now < self._next_imu_s:
