@@ -36,11 +36,17 @@ class Plan:
 
 @dataclass(frozen=True)
 class Extent:
-    """Bounds of a reference over all its plans: largest |q| [rad], |q̇| [rad/s], |q̈| [rad/s²]."""
+    """Bounds of a reference over all its plans: range of q [rad], largest |q̇| [rad/s], |q̈| [rad/s²]."""
 
-    q: float
+    lowest: float
+    highest: float
     q_dot: float
     q_ddot: float
+
+    @property
+    def q(self) -> float:
+        """Largest |q| [rad]."""
+        return max(-self.lowest, self.highest)
 
 
 def minimum_jerk(s: Array) -> Array:

@@ -74,11 +74,12 @@ class Hold(Model):
 
     def extent(self) -> Extent:
         """See `Extent`."""
-        q = float(np.abs(self.angles).max()) + self.overrun
-        distances = np.append(np.diff(self.angles), self.overrun)
+        angles = self.angles
+        distances = np.append(np.diff(angles), self.overrun)
         durations = np.array([self._move_s(distance) for distance in distances])
         return Extent(
-            q,
+            float(angles[0]) - self.overrun,
+            float(angles[-1]) + self.overrun,
             q_dot=QUINTIC_PEAK_RATE * float((distances / durations).max()),
             q_ddot=QUINTIC_PEAK_ACCELERATION * float((distances / durations**2).max()),
         )
@@ -138,7 +139,8 @@ class _Oscillation(Model):
         w, w_dot, w_ddot = quintic(np.linspace(0.0, 1.0, 1001))
         w_dot, w_ddot = w_dot / self.onset_s, np.abs(w_ddot) / self.onset_s**2
         return Extent(
-            q=abs(self.middle) + self.amplitude,
+            self.middle - self.amplitude,
+            self.middle + self.amplitude,
             q_dot=float((w_dot * self.amplitude + w * rate).max()),
             q_ddot=float((w_ddot * self.amplitude + 2.0 * w_dot * rate + w * acceleration).max()),
         )
@@ -234,7 +236,8 @@ class Steps(Model):
         """See `Extent`."""
         span = 2.0 * self.amplitude
         return Extent(
-            q=abs(self.middle) + self.amplitude,
+            self.middle - self.amplitude,
+            self.middle + self.amplitude,
             q_dot=QUINTIC_PEAK_RATE * span / self.move_s,
             q_ddot=QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
         )

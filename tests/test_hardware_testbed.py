@@ -24,6 +24,7 @@ from elastic_env.hardware.errors import HardwareError, PortError
 from elastic_env.hardware.settings import HardwareSettings
 from train.cli import main
 from train.hardware import hardware_arguments
+from train.identify import IdentifyConfig, identified_environments
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
 PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
@@ -150,8 +151,18 @@ def test_mounting_turns_angles_into_the_joints() -> None:
     assert mounting.servo_angle(0.2) == pytest.approx(0.3)
     limits = mounting.servo_limits
     assert (limits.lowest_rad, limits.highest_rad) == pytest.approx((0.2, 1.5))
-    assert link_angle(Attitude(0.0, 0.1, -0.2, 0.0), "pitch", -1, 0.05) == pytest.approx(0.15)
+    assert link_angle(Attitude(0.0, 0.1, -0.2, 0.0), "pitch", -1, -0.2) == 0.0
+    assert link_angle(Attitude(0.0, 0.1, -0.2, 0.0), "pitch", -1, 0.05) == pytest.approx(0.25)
     assert link_angle(Attitude(0.0, 3.0, 0.0, 0.0), "roll", 1, -0.5) == pytest.approx(3.5 - 2 * np.pi)
+
+
+def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> None:
+    """Catches K that is found with the torque of another pendulum."""
+    (tmp_path / "m.yaml").write_text("port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n")
+    arguments = hardware_arguments(None, None, tmp_path / "m.yaml", yes=False)
+    envs = identified_environments(IdentifyConfig(hardware=arguments, second_mass=0.5))
+    pendulums = [env.unwrapped.task.config.pendulum for env in envs]
+    assert [(p.gravity_torque, p.mass) for p in pendulums] == [(52.0, 8.0), (26.0, 4.0)]
 
 
 def test_commands_run_on_hardware(
@@ -162,10 +173,11 @@ def test_commands_run_on_hardware(
     monkeypatch.chdir(tmp_path)
     Path("mounting.yaml").write_text(
         f"port: {emulator.port}\napproach_rad_s: 2.0\nimu_oldest_s: 0.3\n"
-        "limits: {patience_cycles: 10, hang_s: 0.09, slew_rad_s: 2.5}\n"
+        "limits: {patience_cycles: 10, hang_s: 0.09, slew_rad_s: 2.5}\npendulum: {gravity_torque: 60.0, mass: 11.0}\n"
     )
     options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
     assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5
+    assert "pendulum" not in hardware_arguments(emulator.port, None, None, yes=True)  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
     main(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"])
     (episode,) = csv.DictReader(Path("evaluated/episodes.csv").read_text().splitlines())

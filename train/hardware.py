@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.config import load_yaml
+from elastic_env.config import Model, load_yaml
 from elastic_env.errors import ConfigurationError
 from elastic_env.hardware.attitude import AttitudeStream
 from elastic_env.hardware.bus import Bus
@@ -24,6 +24,7 @@ from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.protocol import require_ids
 from elastic_env.hardware.settings import HardwareSettings
+from elastic_env.robots.testbed import Pendulum
 from train.conditions import PolicySpec
 from train.environments import environment
 from train.evaluate import make_policy
@@ -33,13 +34,19 @@ _SCAN_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 _SHOWN_S = 1.0
 
 
+class Mounting(HardwareSettings):
+    """What `--mounting` names: how the testbed is wired and mounted, and the pendulum that hangs there."""
+
+    pendulum: Pendulum = Pendulum()
+
+
 def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | None, yes: bool) -> dict[str, Any]:
     """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command; empty without hardware.
 
     Args:
         port: Port of the servo, or None for that of the settings.
         imu_port: Port of the IMU, likewise.
-        settings: YAML file of `HardwareSettings`, or None.
+        settings: YAML file of a `Mounting`, or None.
         yes: Whether nobody need agree before the first motion.
 
     Raises:
@@ -52,10 +59,10 @@ def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | 
         return {}
     options = {"port": port, "imu_port": imu_port, "confirm": False if yes else None}
     given = {name: value for name, value in options.items() if value is not None}
-    chosen = HardwareSettings(**given) if settings is None else load_yaml(settings, HardwareSettings, given)
-    return {name: getattr(chosen, name) for name in chosen.model_fields_set | options.keys()} | {
-        "limits": chosen.limits.model_dump()
-    }
+    chosen = Mounting(**given) if settings is None else load_yaml(settings, Mounting, given)
+    names = chosen.model_fields_set | options.keys() | {"limits"}
+    values = {name: getattr(chosen, name) for name in names}
+    return {name: value.model_dump() if isinstance(value, Model) else value for name, value in values.items()}
 
 
 def scan(port: str, baudrate: int | None, console: Console) -> int:

@@ -35,8 +35,6 @@ class IdentifyConfig(Model):
     repeats: int = quantity("1", 1, ge=1, description="number of runs with seeds of their own")
     hardware: dict[str, Any] = {}
     """Arguments of `elastic_env/HardwareTestbed-v0` for a real joint; empty for a simulated one."""
-    hold: dict[str, Any] = {}
-    """Parameters of the reference `hold` beside the number of positions."""
 
     @model_validator(mode="after")
     def _masses_differ(self) -> Self:
@@ -73,7 +71,7 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
         ResultsExistError: The output folder holds results.
     """
     plots.require_matplotlib()
-    envs = _environments(config)
+    envs = identified_environments(config)
     with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
         try:
             with _progress(config, console) as progress:
@@ -132,16 +130,19 @@ def result_table(result: Identification) -> Table:
     return table
 
 
-def _environments(config: IdentifyConfig) -> list[Any]:
-    reference = {"kind": "hold", "positions": config.positions, **config.hold}
-    pendulums = [Pendulum()]
+def identified_environments(config: IdentifyConfig) -> list[Any]:
+    """The testbed, once per mass; nothing is opened yet."""
+    reference = {"kind": "hold", "positions": config.positions}
+    hardware = dict(config.hardware)
+    pendulum = Pendulum(**hardware.pop("pendulum", {}))
+    pendulums = [pendulum]
     if config.second_mass is not None:
-        pendulums.append(Pendulum().with_mass_scaled(config.second_mass))
-    if config.hardware:
+        pendulums.append(pendulum.with_mass_scaled(config.second_mass))
+    if hardware:
         return [
             gymnasium.make_vec(
                 "elastic_env/HardwareTestbed-v0", num_envs=1, vectorization_mode="vector_entry_point",
-                reference=reference, pendulum=pendulum, **config.hardware,
+                reference=reference, pendulum=pendulum, **hardware,
             )
             for pendulum in pendulums
         ]  # fmt: skip

@@ -177,6 +177,6 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 
 def link_angle(sample: Attitude, axis: Axis, sign: int, offset_rad: float) -> float:
-    """Link angle [rad], from −π to π: sign · Euler angle − offset."""
-    angle = sign * getattr(sample, axis) - offset_rad
+    """Link angle [rad], from −π to π: sign · (Euler angle − offset), the offset being what the IMU shows at q = 0."""
+    angle = sign * (getattr(sample, axis) - offset_rad)
     return math.remainder(angle, 2.0 * math.pi)

@@ -59,7 +59,7 @@ def _latency_timer(bus: Bus) -> Check:
     latency = bus.port.latency_timer_ms
     if latency is None:
         return Check("latency timer", "not an FTDI adapter, or not told; see the round trip")
-    cure = "" if latency <= 1 else f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{bus.name[5:]}/latency_timer"
+    cure = "" if latency <= 1 else f"echo 1 | sudo tee {bus.port.latency_timer}"
     return Check("latency timer", f"{latency} ms", cure, is_vital=False)
 
 
@@ -111,6 +111,7 @@ def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
         Check("current limit", f"{limit_a:.1f} A",
               unless(limit_a <= needed_a + 0.1, f"{write} {round(needed_a / model.current_unit)} to "
                      f"{model.current_limit}: more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"), is_vital=False),
+        Check("position", f"{get('present_position') * model.position_unit:+.4f} rad"),
         Check("position limits", f"{low_rad:.2f} to {high_rad:.2f} rad"),
         Check("torque", "on" if get("torque_enable") else "off",
               unless(not get("torque_enable"), "a program left it on; it is switched off before anything begins"),

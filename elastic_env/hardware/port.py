@@ -133,11 +133,15 @@ class Port(PortHandler):
                 os.close(lock)
 
     @property
+    def latency_timer(self) -> Path:
+        """The file that holds the adapter's latency timer, if it has one."""
+        return Path("/sys/bus/usb-serial/devices") / Path(os.path.realpath(self.port_name)).name / "latency_timer"
+
+    @property
     def latency_timer_ms(self) -> int | None:
         """How long a USB adapter collects bytes before it passes them on [ms]; None where nobody says."""
-        device = Path("/sys/bus/usb-serial/devices") / Path(os.path.realpath(self.port_name)).name / "latency_timer"
         try:
-            return int(device.read_text())
+            return int(self.latency_timer.read_text())
         except (OSError, ValueError):
             return None
 

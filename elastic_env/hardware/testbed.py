@@ -62,12 +62,12 @@ class HardwareTestbedTask(TestbedTask):
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         super().__init__(config, num_worlds=1)
         self.plant = ServoPlant(self.model, self._at, settings, config.control_period_s, config.pendulum.gravity_torque)
-        reach = config.reference.extent().q
-        limits = settings.limits
-        if not limits.lowest_rad <= -reach <= reach <= limits.highest_rad:
+        extent, limits = config.reference.extent(), settings.limits
+        if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
             raise HardwareError(
-                f"the reference {config.reference.kind!r} can reach ±{reach:.3f} rad, the limits allow "
-                f"{limits.lowest_rad:g} to {limits.highest_rad:g} rad; lower its amplitude or widen the limits"
+                f"the reference {config.reference.kind!r} can reach {extent.lowest:.3f} to {extent.highest:.3f} rad, "
+                f"the limits allow {limits.lowest_rad:g} to {limits.highest_rad:g} rad; lower its amplitude or widen "
+                "the limits"
             )
 
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
