@@ -42,6 +42,15 @@ class Scenario(Model):
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
 
+    @property
+    def is_random(self) -> bool:
+        """Whether episodes of the same motion differ: robots, pushes and slopes that are drawn, noise."""
+        drawn = (
+            self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.gyro_noise_rad_s,
+            self.force_noise_n, self.moment_noise_nm,
+        )  # fmt: skip
+        return any(value > 0.0 for value in drawn) or self.imu.is_random or self.pelvis_imu.is_random
+
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
 # the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs at 500 Hz

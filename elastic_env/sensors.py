@@ -15,12 +15,10 @@ class AttitudeSensor(Model):
     sine_error_rad: float = quantity("rad", 0.0, description="amplitude of an error proportional to sin(angle)")
     rate_hz: float = quantity("Hz", 100.0, gt=0, description="sample rate; the value is held in between")
 
-
-class MotorEncoder(Model):
-    """Encoder on the motor side: counts per turn of the output and a homing error."""
-
-    counts_per_turn: int | None = quantity("1", None, gt=0, description="counts per output turn; None for continuous")
-    bias_spread_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the homing error, drawn per episode")
+    @property
+    def is_random(self) -> bool:
+        """Whether it measures the same motion differently from episode to episode."""
+        return self.noise_rad > 0.0 or self.bias_spread_rad > 0.0
 
 
 def quantise(angle: Array, counts_per_turn: int | None) -> Array:

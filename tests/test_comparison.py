@@ -145,7 +145,12 @@ def test_probability_of_improvement_counts_all_pairs_of_seed_and_episode() -> No
 
 def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:
     """A folder that says of itself what a residual does, without weights."""
-    config = {"scenarios": ["ideal", "soft"], "reference": 3, "seeds": [1, 2, 10], **values.pop("config", {})}
+    config = {
+        "scenarios": ["ideal", "soft", "ideal+soft", "ideal+spread"],
+        "reference": 3,
+        "seeds": [1, 2, 10],
+        **values.pop("config", {}),
+    }
     training = {"config": config} if seed is None else {"config": config, "seed": seed}
     description = ResidualDescription(**{"robot": "walker", "base": "input_output", "training": training, **values})
     folder.mkdir(parents=True)
@@ -298,6 +303,8 @@ def test_conditions_are_marked_by_what_training_has_seen() -> None:
     """Catches a ceiling sold as a proof, and a held-out scenario, step period or group that is not called so."""
     marks: list[tuple[str, Any, tuple[str, ...]]] = [
         ("ideal", 3, (CEILING,)),
+        ("ideal+soft", 3, (CEILING,)),
+        ("ideal+spread", 3, ()),
         ("soft", {"step_period": 3, "num_steps": 2}, ()),
         ("slope", 3, ("held out",)),
         ("ideal", 1.6, ("held out step period",)),

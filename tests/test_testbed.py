@@ -833,3 +833,24 @@ def test_a_reference_without_a_scored_step_is_an_error() -> None:
     """Catches metrics that are nan without a word."""
     with pytest.raises(ConfigurationError, match="no scored control step"):
         make_testbed(reference={"kind": "sine", "duration_s": 1e-3})
+
+
+@pytest.mark.parametrize("scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"])
+def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) -> None:
+    """Catches a ceiling that is none, and identical episodes that count as many."""
+    envs = [
+        gymnasium.make("elastic_env/Testbed-v0", scenario=scenario, reference="sine", observe_link=True)
+        for _ in range(2)
+    ]
+    runs = []
+    for seed, env in enumerate(envs):
+        seen = [env.reset(seed=seed)[0]]
+        seen += [env.step(np.full(1, 0.01, np.float32))[0] for _ in range(300)]
+        runs.append(np.array(seen))
+    assert make_scenario(scenario).is_random == (not np.array_equal(*runs))
+
+
+def test_robots_pushes_and_slopes_are_drawn() -> None:
+    """Catches a walker's condition taken for one and the same walk."""
+    assert all(make_scenario(f"ideal+{change}").is_random for change in ("spread", "push", "slope"))
+    assert not make_scenario("ideal+stiff").is_random

@@ -13,7 +13,6 @@ from train.families import Origin, origin
 from train.statistics import Estimate, change, improvement, over_seeds, pair
 
 CEILING, HELD_OUT = "ceiling on the training condition", "held out"
-_DETERMINISTIC = "ideal"
 """Scenario in which nothing is random: training and evaluation see the same."""
 
 _SMALL = 0.0995
@@ -277,7 +276,8 @@ def _marks(
     if trained.scenarios is None:
         return ("training condition unknown",)
     known = environment(trained.environment)
-    seen = _motion(known, known.default_reference if trained.reference is None else trained.reference) == reference
+    motion: Any = known.default_reference if trained.reference is None else trained.reference
+    seen = _motion(known, motion) == reference
     unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
     quantity = known.quantity or "reference"
     if unseen:
@@ -285,7 +285,7 @@ def _marks(
         return (f"{HELD_OUT}{named}" if seen else f"{HELD_OUT}{named or ' scenario'} and {quantity}",)
     if not seen:
         return (f"{HELD_OUT} {quantity}",)
-    deterministic = any(scenario.split("+")[0] == _DETERMINISTIC for scenario in scenarios)
+    deterministic = any(known.is_deterministic(scenario, motion) for scenario in scenarios)
     return (CEILING,) if deterministic and not swept else ()
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.references import make_reference
+from elastic_env.scenario import make_scenario
 from elastic_env.walking.gait import Gait
 
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
@@ -88,6 +90,7 @@ class Environment:
         default_reference: Reference where none is named.
         arguments: Arguments of `gymnasium.make` for a reference.
         label: How tables and figures call a reference.
+        draws: Whether episodes of a reference have motions of their own.
         abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where there is nothing.
         traced: Signals of the first episode that are kept.
         columns: The summary table.
@@ -111,6 +114,7 @@ class Environment:
     default_reference: Reference
     arguments: Callable[[Reference], dict[str, Any]]
     label: Callable[[Reference], str]
+    draws: Callable[[Reference], bool]
     abscissa: Callable[[Reference], dict[str, float]]
     traced: tuple[str, ...]
     columns: tuple[Column, ...]
@@ -127,6 +131,10 @@ class Environment:
     quantity: str = ""
     failure: str = "fail"
     is_real: bool = False
+
+    def is_deterministic(self, scenario: str, reference: Reference) -> bool:
+        """Whether all episodes of a condition are one and the same."""
+        return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
 
     def title(self, reference_name: str) -> str:
         """A reference's name as it stands in titles."""
@@ -150,6 +158,10 @@ def environment(name: str) -> Environment:
 
 def _kind(reference: Reference) -> str:
     return str(reference.get("kind")) if isinstance(reference, dict) else str(reference)
+
+
+def _is_drawn(reference: Any) -> bool:
+    return make_reference(reference).is_random
 
 
 def _step_period(reference: Reference) -> Any:
@@ -190,6 +202,7 @@ _TESTBED = Environment(
     default_reference="hold",
     arguments=lambda reference: {"reference": reference},
     label=_kind,
+    draws=_is_drawn,
     abscissa=lambda _: {},
     traced=(
         "time_s", "reference_angle", "link_angle", "link_angle_imu", "deflection", "link_error", "link_error_imu",
@@ -222,6 +235,7 @@ _WALKER = Environment(
     default_reference=3,
     arguments=_walk_arguments,
     label=_walk_label,
+    draws=lambda _: False,
     abscissa=_walk_abscissa,
     traced=(
         "time_s", "pelvis_roll", "pelvis_pitch", "zmp_x", "zmp_y", "zmp_reference_x", "zmp_reference_y",

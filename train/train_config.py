@@ -64,14 +64,15 @@ class TrainConfig(Model):
         return environment(self.env).default_reference if self.reference is None else self.reference
 
     def condition(self, scenario: str, policy: str) -> Condition:
-        """A cell in which a policy is evaluated on the way."""
+        """A cell in which a policy is evaluated on the way; where nothing is drawn, one episode is all there is."""
+        is_one = environment(self.env).is_deterministic(scenario, self.motion)
         return Condition(
             env=self.env,
             policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
             scenario=scenario,
             reference=self.motion,
             env_options=self.env_options,
-            episodes=1 if scenario == "ideal" else self.evaluation_episodes,
+            episodes=1 if is_one else self.evaluation_episodes,
             seed=EVALUATION_SEED,
         )
 
