@@ -37,6 +37,7 @@ def configure_testbed(
     form: Literal["tendon", "rigid"] = "tendon",
     observe_link: bool = False,
     reward: RewardWeights | dict[str, float] | None = None,
+    timestep_s: float | None = None,
 ) -> TestbedConfig:
     """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
 
@@ -49,6 +50,7 @@ def configure_testbed(
         form: "tendon" for the elastic joint, "rigid" for what an inelastic testbed would do.
         observe_link: Whether the link's IMU is part of the observation.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
+        timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -65,6 +67,7 @@ def configure_testbed(
         form=form,
         observe_link=observe_link,
         reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
+        **({} if timestep_s is None else {"timestep_s": timestep_s}),
     )
 
 
@@ -79,6 +82,7 @@ def configure_walk(
     form: Literal["tendon", "rigid"] = "tendon",
     reward: WalkRewardWeights | dict[str, float] | None = None,
     bank: int = 0,
+    timestep_s: float | None = None,
 ) -> WalkConfig:
     """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
 
@@ -94,6 +98,7 @@ def configure_walk(
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         bank: Number of the bank that random robots come from, to keep those that are learned from apart.
+        timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -120,6 +125,7 @@ def configure_walk(
         form=form,
         reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
         bank=bank,
+        **({} if timestep_s is None else {"timestep_s": timestep_s}),
     )
 
 

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
+from elastic_env.errors import ConfigurationError
 from elastic_env.signals import Array, BoolArray
 
 
@@ -185,3 +186,17 @@ def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Si
         num_threads: Threads for many worlds, 0 for all cores; the results do not depend on it.
     """
     return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
+
+
+def substeps(control_period_s: float, timestep_s: float) -> int:
+    """Physics steps in a control period.
+
+    Raises:
+        ConfigurationError: The control period is no multiple of the physics step.
+    """
+    ratio = control_period_s / timestep_s
+    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+        raise ConfigurationError(
+            f"timestep_s must divide the control period of {control_period_s:g} s, got {timestep_s:g} s"
+        )
+    return round(ratio)

@@ -16,7 +16,7 @@ from elastic_env.rendering import TestbedPicture
 _ID = "elastic_env/HardwareTestbed-v0"
 SCENARIO = "hardware"
 """What stands for the scenario in tables of results."""
-_OF_A_SIMULATION = ("form",)
+_OF_A_SIMULATION = ("form", "timestep_s")
 
 
 def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTestbedTask:
@@ -24,8 +24,8 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
 
     Args:
         port: Port of the servo.
-        **arguments: Those of `HardwareSettings`, and of `elastic_env.entry_points.configure_testbed` but for `form`;
-            `scenario` can only be "hardware" or "nominal", and changes nothing.
+        **arguments: Those of `HardwareSettings`, and of `elastic_env.entry_points.configure_testbed` but for `form` and
+            `timestep_s`; `scenario` can only be "hardware" or "nominal", and changes nothing.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.

@@ -29,8 +29,8 @@ from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec
 from elastic_env.rows import Rows
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
 from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
-from elastic_env.simulation import Simulation
-from elastic_env.tasks.testbed_config import TestbedConfig, num_substeps, require_feasible
+from elastic_env.simulation import Simulation, substeps
+from elastic_env.tasks.testbed_config import TestbedConfig, require_feasible
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
@@ -124,7 +124,7 @@ class TestbedTask:
         require_feasible(config)
         self.config = config
         self.num_worlds = num_worlds
-        self.num_substeps = num_substeps(config)
+        self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         self.observation_table = SignalTable((*OBSERVATION, LINK_IMU)) if config.observe_link else OBSERVATION
         self.assumed_model = config.robot_model(config.joint, config.pendulum, self.observation_table)
         self._joint, self._pendulum = config.true_joint, config.true_pendulum

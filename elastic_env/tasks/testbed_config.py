@@ -72,21 +72,6 @@ class TestbedConfig(Model):
         return RobotModel({JOINT: joint}, rigid_spec(pendulum).compile(), self.control_period_s, table)
 
 
-def num_substeps(config: TestbedConfig) -> int:
-    """Physics steps in a control period.
-
-    Raises:
-        ConfigurationError: The control period is no multiple of the physics step.
-    """
-    ratio = config.control_period_s / config.timestep_s
-    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
-        raise ConfigurationError(
-            "control_period_s must be a multiple of timestep_s, "
-            f"got {config.control_period_s} s and {config.timestep_s} s"
-        )
-    return round(ratio)
-
-
 def require_feasible(config: TestbedConfig) -> None:
     """A reference that the servo cannot follow is an error now, not a poor result later."""
     joint, pendulum, extent = config.true_joint, config.true_pendulum, config.reference.extent()

@@ -30,7 +30,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from elastic_env.elasticity import joint_torque
-from elastic_env.errors import ConfigurationError
 from elastic_env.metrics import Metric
 from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
@@ -38,7 +37,7 @@ from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
 from elastic_env.scenario import Scenario
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
-from elastic_env.simulation import Simulation
+from elastic_env.simulation import Simulation, substeps
 from elastic_env.tasks.walk_config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
@@ -91,7 +90,7 @@ class WalkTask:
     def __init__(self, config: WalkConfig, num_worlds: int) -> None:
         self.config = config
         self.num_worlds = num_worlds
-        self.num_substeps = _num_substeps(config)
+        self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
         model = self.assumed_model = WalkerModel(
@@ -419,13 +418,3 @@ TOUCHDOWN = -1
 """Row of the touch-downs among the phases."""
 FIRST_HALF, SECOND_HALF = 1, 2
 """Of a swing."""
-
-
-def _num_substeps(config: WalkConfig) -> int:
-    ratio = config.control_period_s / config.timestep_s
-    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
-        raise ConfigurationError(
-            "control_period_s must be a multiple of timestep_s, "
-            f"got {config.control_period_s} s and {config.timestep_s} s"
-        )
-    return round(ratio)
