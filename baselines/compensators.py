@@ -2,6 +2,8 @@ r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), and
 
 An input compensator says by how much the motor side has to lead so that the link is where it should be; an output
 compensator says where the link is when the motor encoder shows θ. All work on (..., n) arrays.
+
+[Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 """
 
 import copy

@@ -150,7 +150,7 @@ class WalkingController:
         return np.clip(z, -gains.force_difference_limit_m, gains.force_difference_limit_m)
 
     def _vertical_forces(self, rows: Array) -> Array:
-        """Along the legs' soles, which are nearly level, (num_worlds, 2) [N]."""
+        """Along the normals of the soles, which are nearly vertical, (num_worlds, 2) [N]."""
         return rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2]
 
     def _zmp_shift(

@@ -19,7 +19,10 @@ QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 class Plan:
     """Samples of a reference at the control rate; row k is the target at the end of control period k, row 0 the start.
 
-    `scored` marks the rows that count in metrics; `rest` numbers the windows at rest of `Hold`, -1 elsewhere.
+    Attributes:
+        q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,) [rad], [rad/s], [rad/s²].
+        scored: Rows that count in metrics, (T,).
+        rest: Number of the window at rest of `Hold`, −1 elsewhere, (T,).
     """
 
     q: Array
@@ -85,7 +88,7 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
 
 @dataclass(frozen=True)
 class PlanRow:
-    """The reference of every world at its present step, (num_worlds,) each."""
+    """The reference of every world at its present step, (num_worlds,) each; see `Plan`."""
 
     q: Array
     q_dot: Array

@@ -55,13 +55,11 @@ def test_named_gaits_have_the_phases_of_the_paper(step_period: float, durations:
 
 def counted(first: int, single: int, last: int, num_steps: int) -> dict[str, Array]:
     """The walk counted out, row by row, in control steps."""
-    rows: dict[str, list[float]] = {
-        name: [] for name in ("step", "support", "single", "swing", "transition", "walking")
-    }
+    rows: dict[str, list[float]] = {name: [] for name in ("support", "single", "swing", "transition", "walking")}
 
     def add(step: int, swing: int, near: bool, walking: bool) -> None:
         support = min(max(step, 0), num_steps - 1) % 2
-        values = (step, support, 0 < swing < single, swing / single, near, walking)
+        values = (support, 0 < swing < single, swing / single, near, walking)
         for row, value in zip(rows.values(), values, strict=True):
             row.append(value)
 

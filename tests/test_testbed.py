@@ -26,6 +26,7 @@ from elastic_env.scenario import make_scenario, scenario_names
 from elastic_env.signals import Array
 from elastic_env.tasks import testbed
 from elastic_env.tasks.testbed_config import TestbedConfig
+from tests.docstrings import documented_tables
 
 ID = "elastic_env/Testbed-v0"
 PERIOD_S = TestbedConfig().control_period_s
@@ -193,12 +194,15 @@ def test_no_column_of_the_observation_is_constant() -> None:
 def test_docstring_of_the_module_is_the_table_of_signals() -> None:
     """Catches a table in the documentation that names, orders or measures the columns otherwise than the code."""
     table = make_testbed(observe_link=True).task.observation_table
-    rows = [line.strip("| ").split(" | ") for line in (testbed.__doc__ or "").splitlines() if line.startswith("| ")][1:]
+    rows, info = documented_tables(testbed.__doc__ or "")
     documented = [(int(column), name.strip("`"), unit) for column, name, unit, _ in rows]
     assert documented == [(i, signal.name, signal.unit) for i, signal in enumerate(table)]
     assert make_testbed().task.observation_table.names == table.names[:-1]
     bound = make_testbed().task.action_table.signals[0]
     assert f"[{bound.unit}], within ±{bound.high}" in (testbed.__doc__ or "")
+    env: Any = gymnasium.make("elastic_env/Testbed-v0", reference="sine")
+    env.reset(seed=0)
+    assert info == {*env.step(np.zeros(1, np.float32))[4], "episode_metrics"}
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from elastic_env.signals import Array
 from elastic_env.tasks import walk_config, walk_in_place
 from elastic_env.tasks.walk_config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
 from elastic_env.tasks.walk_in_place import tilt_penalty, zmp_penalty
+from tests.docstrings import documented_tables
 
 ID = "elastic_env/WalkInPlace-v0"
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
@@ -254,9 +255,9 @@ def test_docstring_of_the_module_is_the_table_of_signals() -> None:
     """Catches a table in the documentation that names, orders or measures the columns otherwise than the code."""
     task = make_walk(**SHORT).task
     signals = list(task.observation_table)
-    rows = [line.strip("| ").split(" | ") for line in (walk_in_place.__doc__ or "").splitlines() if line[:2] == "| "]
+    rows, info = documented_tables(walk_in_place.__doc__ or "")
     next_column = 0
-    for columns, names, units, _ in rows[1:]:
+    for columns, names, units, _ in rows:
         first, *last = (int(number) for number in re.findall(r"\d+", columns))
         assert first == next_column, columns
         next_column = (last[-1] if last else first) + 1
@@ -272,6 +273,9 @@ def test_docstring_of_the_module_is_the_table_of_signals() -> None:
     assert task.action_table.names == tuple(f"command_offset.{joint}" for joint in JOINTS)
     assert re.search(rf"\[rad\] in the order of the joints, within ±{task.action_table.signals[0].high}\.", DOC)
     assert f"joints are {', '.join(JOINTS[:6])}," in DOC
+    env = make_walk(**SHORT)
+    env.reset(seed=0)
+    assert info == {*env.step(np.zeros(12, np.float32))[4], "episode_metrics"}
 
 
 DOC = " ".join((walk_in_place.__doc__ or "").split())

@@ -255,7 +255,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
                 num_pairs=sum(len(p) for pairs in seeds for p in pairs),
                 falls=sum(e.num_failed for e in mine), episodes=sum(len(e.episodes) for e in mine),
                 base_falls=sum(e.num_failed for e in theirs), base_episodes=sum(len(e.episodes) for e in theirs),
-                failure="falls" if known.failure == "falls" else "failures",
+                failure=known.failures,
             )
         )  # fmt: skip
     return rows

@@ -100,6 +100,11 @@ class Condition(Model):
         return self.label or self.environment.label(self.reference)
 
     @property
+    def number(self) -> float | None:
+        """What of the reference scores can be drawn against, such as the step period [s]; None for nothing."""
+        return next(iter(self.environment.abscissa(self.reference).values()), None)
+
+    @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of the environment; what the policy says goes before, and what the reference says before that."""
         motion = self.environment.arguments(self.reference)

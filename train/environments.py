@@ -136,6 +136,11 @@ class Environment:
         """Whether all episodes of a condition are one and the same."""
         return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
 
+    @property
+    def failures(self) -> str:
+        """What such episodes are called in a sentence."""
+        return "falls" if self.failure == "falls" else "failures"
+
     def title(self, reference_name: str) -> str:
         """A reference's name as it stands in titles."""
         return f"{self.quantity} {reference_name}".strip()

@@ -14,11 +14,13 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.static_points import HoldRecorder, StaticPoints
 from elastic_env.errors import ConfigurationError
 from elastic_env.robots.robot_model import WalkerModel
-from elastic_env.signals import Array
+from elastic_env.signals import Array, BoolArray
 from train.conditions import Condition, PolicySpec
 from train.support_changes import SupportChanges
 
 _MAX_WORLDS = 64
+_BEFORE_FALL_S = 0.6
+"""What happens in this time before a fall does not set the scale of a figure [s]."""
 
 Progress = Callable[[int], None]
 
@@ -55,6 +57,12 @@ class Evaluation:
     def first_failed(self) -> bool:
         """Whether the episode of the trace is one of them."""
         return bool(self.episodes and self.episodes[0]["termination"])
+
+    @property
+    def is_steady(self) -> BoolArray:
+        """Samples of the trace that a figure's range goes by: all but those shortly before a fall."""
+        time_s = self.trace["time_s"]
+        return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
 
 
 def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = None) -> Any:

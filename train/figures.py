@@ -79,11 +79,11 @@ def option_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
 
 def reference_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
     """A curve per policy over the number of the references."""
-    return [Curve(title, [_number(e) for e in own], own) for title, own in _by_policy(evaluations).items()]
+    return [Curve(title, [e.condition.number for e in own], own) for title, own in _by_policy(evaluations).items()]
 
 
 def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment, folder: Path) -> list[Path]:
-    if len({_number(e) for e in evaluations} - {None}) < MIN_SWEPT_REFERENCES:
+    if len({e.condition.number for e in evaluations} - {None}) < MIN_SWEPT_REFERENCES:
         return []
     scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
     return [
@@ -100,12 +100,6 @@ def _by_policy(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]
     for evaluation in evaluations:
         policies.setdefault(evaluation.condition.policy.title, []).append(evaluation)
     return policies
-
-
-def _number(evaluation: Evaluation) -> float | None:
-    """What of a reference scores can be drawn against."""
-    condition = evaluation.condition
-    return next(iter(condition.environment.abscissa(condition.reference).values()), None)
 
 
 def _stem(evaluation: Evaluation) -> str:

@@ -75,7 +75,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         env: An environment of ours.
         base_policy: A policy for it, or the name of one.
         space: "model" or "joint", see `baselines.correction`.
-        scale: Correction at a residual of 1.
+        scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
+            by the end of their names; None for 0.6 or 0.02 rad.
         decision_period: Control steps per decision.
         **settings: Further parameters of `ResidualSettings`.
 
@@ -134,7 +135,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
         space: "model" or "joint", see `baselines.correction`.
-        scale: Correction at a residual of 1.
+        scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
+            by the end of their names; None for 0.6 or 0.02 rad.
         decision_period: Control steps per decision.
         **settings: Further parameters of `ResidualSettings`.
 

@@ -109,7 +109,7 @@ def measure(config: SpeedConfig, progress: Callable[[], None] | None = None) -> 
 def _entries(config: SpeedConfig) -> list[_Entry]:
     """What is timed, every reference before or right after what is compared with it."""
     threads, env = config.threads or os.cpu_count() or 1, config.env
-    policy = config.policy or {"walker": "input_wrench", "testbed": "input"}.get(env, "zero")
+    policy = _policy(config)
     entries: list[_Entry] = []
     for n in config.num_envs:
         loop = VectorLoop(env, n, min(threads, n))
@@ -133,6 +133,11 @@ def _entries(config: SpeedConfig) -> list[_Entry]:
     return entries
 
 
+def _policy(config: SpeedConfig) -> str:
+    """The policy in the loop: the one that is asked for, or the environment's best that needs no truth."""
+    return config.policy or {"walker": "input_wrench", "testbed": "input"}.get(config.env, "zero")
+
+
 def _result(config: SpeedConfig, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:
     entry, reference = entries[number], entries[entries[number].against]
     mine, others = rates[number][1:], rates[entry.against][1:]
@@ -150,8 +155,7 @@ def _result(config: SpeedConfig, entries: Sequence[_Entry], rates: list[list[flo
 def profile(config: SpeedConfig) -> str:
     """Where the time of the vector environment with its policy goes, as text."""
     threads, n = config.threads or os.cpu_count() or 1, config.num_envs[0]
-    policy = config.policy or {"walker": "input_wrench", "testbed": "input"}.get(config.env)
-    loop = VectorLoop(config.env, n, min(threads, n), policy)
+    loop = VectorLoop(config.env, n, min(threads, n), _policy(config))
     loop.run(config.steps)
     profiler = cProfile.Profile()
     profiler.enable()

@@ -2,6 +2,9 @@
 
 What is drawn at random in learning is the training seed, so intervals are over training seeds and never over the
 episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its base on the same episodes.
+
+[Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS.
+[Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons of Reinforcement Learning Algorithms".
 """
 
 from collections.abc import Mapping, Sequence

@@ -15,8 +15,6 @@ from train.evaluate import Evaluation
 from train.plots import FAILED, MM, MRAD, colours, columns_of, line_style, require_matplotlib, save
 
 _SHADE = "#e9ebee"
-_BEFORE_FALL_S = 0.6
-"""What happens in this time before a fall does not set the scale [s]."""
 _PAPER_BOUND_MRAD = 10.0
 """What the pelvis error stays below with compensation in the paper, in its two gaits."""
 _PAPER_LABEL = "paper, compensated: ±10 mrad"
@@ -106,10 +104,8 @@ def _draw_lines(
 
 def _range(evaluation: Evaluation, signal: str, reference: str | None) -> tuple[float, float]:
     """Smallest and largest value of a signal and its reference, shortly before a fall left out."""
-    trace = evaluation.trace
-    end = trace["time_s"][-1] - (_BEFORE_FALL_S if evaluation.first_failed else 0.0)
     names = [signal] if reference is None else [signal, reference]
-    values = np.concatenate([trace[name][trace["time_s"] <= max(end, 0.0)] for name in names])
+    values = np.concatenate([evaluation.trace[name][evaluation.is_steady] for name in names])
     values = values[np.isfinite(values)]
     return float(values.min()), float(values.max())
 

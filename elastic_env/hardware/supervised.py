@@ -69,7 +69,7 @@ class SupervisedBus:
         self._keeper: threading.Thread | None = None
         self._is_kept = threading.Event()
         try:
-            self.is_realtime = bool(self._hear(0)["is_realtime"])
+            self._hear(0)
             self.models: list[list[int]] = self._ask("attach", ids=list(self._ports.values()))["models"]
         except BaseException:
             self.close()

@@ -9,7 +9,6 @@ torque is off. Torque goes off when
 * it is itself asked to end (SIGTERM, SIGHUP, SIGINT), also during a read.
 """
 
-import os
 import signal
 import socket
 import sys
@@ -218,7 +217,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     """Open the ports, say how that went, and serve."""
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         signal.signal(number, _end)
-    is_realtime = prefer_realtime()
+    prefer_realtime()
     buses = [Bus(port, baudrate) for port in ports]
     opened: list[Bus] = []
     try:
@@ -230,7 +229,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
             bus.close()
         channel.send({"number": 0, "error": "PortError", "message": str(error)})
         return
-    channel.send({"number": 0, "is_realtime": is_realtime, "process": os.getpid()})
+    channel.send({"number": 0})
     Supervisor(channel, buses).run()
 
 

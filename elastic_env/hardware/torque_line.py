@@ -9,14 +9,11 @@ which takes the torque limit from the same line). It is a rough figure: gear and
 import numpy as np
 import numpy.typing as npt
 
+from elastic_env.robots.dynamixel import LOSS_NM, SERVO, TORQUE_PER_CURRENT
 from elastic_env.signals import Array
 
-TORQUE_PER_CURRENT = 4.338
-"""Slope [N·m/A]."""
-LARGEST_TORQUE_NM = 84.0
+LARGEST_TORQUE_NM = SERVO.torque_limit
 """What the leg's servos of THORMANG3 are limited to, 20 A on this line; more hurts the gear [N·m]."""
-LOSS_NM = 2.694
-"""Torque that does not reach the output [N·m]."""
 
 
 def torque_of_current(current: npt.ArrayLike) -> Array:

@@ -24,6 +24,9 @@ BACKLASH_BOUND_RAD = 1.75e-3
 ENCODER_COUNTS_PER_TURN = 501_923
 """Counts of the motor encoder per turn of the output."""
 
+TORQUE_PER_CURRENT, LOSS_NM = 4.338, 2.694
+"""The measured line: slope [N·m/A], and torque that does not reach the output [N·m]."""
+
 _ROTOR_INERTIA_KG_M2 = 33.3e-7
 _GEAR_RATIO = 501.923
 _CURRENT_LIMIT_A = 1240 * 33.0 / 2048
@@ -34,7 +37,7 @@ SERVO = Servo(
     position_gain=_POSITION_GAIN,
     velocity_gain=250.0,
     integral_gain=_POSITION_GAIN / _INTEGRATOR_TIME_S,
-    torque_limit=round(4.338 * _CURRENT_LIMIT_A - 2.694, 1),
+    torque_limit=round(TORQUE_PER_CURRENT * _CURRENT_LIMIT_A - LOSS_NM, 1),
     speed_limit=round(33.1 * 2.0 * math.pi / 60.0, 2),
 )
 

@@ -13,6 +13,24 @@ Observation of one world (float64):
 | 6 | `link_angle_imu` | rad | IMU on the link; only with `observe_link=True` |
 
 Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], within ±0.3.
+
+`info` of one world, all at the end of the control period, the truth where nothing else is said:
+
+| key | unit | meaning |
+|---|---|---|
+| `time_s` | s | since the start of the episode |
+| `reference_angle` | rad | q_ref |
+| `link_angle`, `link_angle_imu` | rad | q, and what its IMU shows |
+| `link_error`, `link_error_imu` | rad | q_ref − q, and by the IMU; positive where the link hangs behind |
+| `deflection` | rad | δ = θ − q |
+| `joint_torque` | N·m | of spring and damper on the link, positive along q |
+| `servo_error` | rad | θ_cmd − θ |
+| `command_rate` | rad/s | rate of change of the offset a |
+| `rest` | 1 | number of the window at rest of `hold`, −1 elsewhere |
+| `clipped` | 1 | 1 where the action was beyond its bounds |
+| `reward_terms` | 1 | weighted terms of the reward, by name |
+| `termination` | | why the episode ended: "diverged", or "" |
+| `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit |
 """
 
 from collections.abc import Sequence
@@ -63,7 +81,15 @@ METRICS = (
 
 @dataclass(frozen=True)
 class TestbedTruth:
-    """Noise-free state of the testbed, (num_worlds, 1) each, and its true parameters. For scoring and the oracle."""
+    """Noise-free state of the testbed and its true parameters, one row per world. For scoring and the oracle.
+
+    Attributes:
+        theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 1) [rad], [rad/s].
+        deflection: θ − q, (num_worlds, 1) [rad].
+        joint_torque: Of spring and damper on the link, (num_worlds, 1) [N·m].
+        stiffness: True K, (num_worlds, 1) [N·m/rad].
+        model: The true joint and pendulum.
+    """
 
     __test__ = False
 
@@ -79,7 +105,17 @@ class TestbedTruth:
 
 @dataclass(frozen=True, slots=True)
 class TestbedSample(Rows):
-    """What a step is scored by, (n,) each; names as in the signals that are made of it."""
+    """What a step is scored by, (n,) each.
+
+    Attributes:
+        step: Control steps since the start of the episode.
+        q_ref: Reference [rad].
+        scored, rest: Whether the step counts in metrics; number of the window at rest, −1 elsewhere.
+        theta, theta_dot, q, q_dot: Motor and link side [rad], [rad/s].
+        imu: Link angle as the IMU shows it [rad].
+        servo_error: θ_cmd − θ [rad].
+        command_rate: Rate of change of the offset [rad/s].
+    """
 
     __test__ = False
 

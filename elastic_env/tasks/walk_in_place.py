@@ -23,6 +23,35 @@ then the same of the right leg (r_...); a name before a dot has one column per j
 | 83 to 94 | `last_command.<joint>` | rad | θ_cmd of the last control period |
 
 Action of one world (float32): the command offsets a = θ_cmd − q_ref [rad] in the order of the joints, within ±0.3.
+
+`info` of one world, all at the end of the control period, the truth where nothing else is said; positions are in the
+plan's world frame, x forward, y to the left:
+
+| key | unit | meaning |
+|---|---|---|
+| `time_s` | s | since the start of the episode |
+| `pelvis_roll`, `pelvis_pitch` | rad | attitude of the pelvis, positive to the right and forward down |
+| `pelvis_error` | rad | angle between its z axis and the vertical, never negative |
+| `pelvis_height` | m | of the pelvis' origin |
+| `zmp_x`, `zmp_y` | m | ZMP by the ankle sensors; nan where the feet carry almost nothing |
+| `zmp_reference_x`, `zmp_reference_y` | m | planned |
+| `zmp_deviation` | m | distance to the plan; nan likewise |
+| `zmp_deviation_x`, `zmp_deviation_y` | m | its parts, measured − planned |
+| `link_error` | rad | rms of q_ref − q over the twelve joints |
+| `link_error_lowest`, `link_error_highest` | rad | smallest and largest of them |
+| `deflection` | rad | rms of δ = θ − q over the joints |
+| `joint_torque` | N·m | largest magnitude of the joints' spring torques |
+| `servo_torque` | N·m | rms over the joints |
+| `command_rate` | rad/s | rms of the rate of change of the offsets |
+| `force_left`, `force_right` | N | vertical force of the ground on each foot |
+| `load_share` | 1 | planned share of the weight on the right foot |
+| `swing`, `single_support` | 1 | progress of the swing; 1 where one foot carries alone, else 0 |
+| `support` | 1 | support foot of the step, 0 left, 1 right |
+| `early_touchdown` | s | at a planned touch-down, how long the foot has been on the ground; 0 elsewhere |
+| `clipped` | 1 | 1 where an action was beyond its bounds |
+| `reward_terms` | 1 | weighted terms of the reward, by name |
+| `termination` | | why the episode ended: "fell", "diverged", or "" |
+| `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit; ZMP where loaded |
 """
 
 from collections.abc import Sequence

@@ -94,7 +94,6 @@ class Timing:
 
     Attributes:
         time: Time from the start of the episode [s].
-        step: Number of the step, -1 before the walk, num_steps after it.
         support: Support foot of the step, `LEFT` or `RIGHT`; before and after the walk that of the next or last step.
         single: Whether the other foot is off the ground.
         swing: Progress of the swing, 0 to 1; 0 and 1 before and after it.
@@ -103,7 +102,6 @@ class Timing:
     """
 
     time: Array
-    step: IntArray
     support: IntArray
     single: BoolArray
     swing: Array
@@ -123,8 +121,7 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
     since = np.arange(len(time)) - begin  # control steps since the walk began
-    step = np.where(since <= 0, -1, np.minimum((since - 1) // period, gait.num_steps))
-    of_walk = np.clip(step, 0, gait.num_steps - 1)
+    of_walk = np.clip((since - 1) // period, 0, gait.num_steps - 1)
     within = since - of_walk * period - first  # control steps since lift-off
     swing = np.clip(within / single, 0.0, 1.0)
     lift_offs = np.arange(gait.num_steps) * period + first
@@ -133,7 +130,6 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
-        step=step,
         support=of_walk % 2,
         single=(within > 0) & (within < single),
         swing=swing,

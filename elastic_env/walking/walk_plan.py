@@ -37,6 +37,7 @@ class WalkPlan:
         zmp_of_motion: ZMP of the planned motion by inverse dynamics, (T, 2) [m].
         com, com_dot: Center of mass in the plane, (T, 2) [m], [m/s].
         com_height: Height of the center of mass over the ground while the robot stands [m].
+        gravity: Acceleration of gravity [m/s²].
         pelvis: Position of the level pelvis, (T, 3) [m].
         ankles: Left and right ankle, (T, 2, 3) [m].
         share: Share μ of the weight on the right foot, (T,).
@@ -53,6 +54,7 @@ class WalkPlan:
     com: Array
     com_dot: Array
     com_height: float
+    gravity: float
     pelvis: Array
     ankles: Array
     share: Array
@@ -66,7 +68,7 @@ class WalkPlan:
     @property
     def omega(self) -> float:
         """Natural frequency of the inverted pendulum, √(g/z_c) [1/s]."""
-        return float(np.sqrt(9.81 / self.com_height))
+        return float(np.sqrt(self.gravity / self.com_height))
 
 
 @lru_cache(maxsize=32)
@@ -86,7 +88,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     ankles = _ankle_paths(gait, timing, biped)
     zmp = zmp_reference(gait, timing, biped.footholds)
     standing, com_height = _standing(gait, biped, zmp[0], ankles[0])
-    preview = PreviewConfig(com_height_m=com_height, period_s=control_period_s)
+    preview = PreviewConfig(com_height_m=com_height, period_s=control_period_s, gravity=biped.gravity)
     motion = follow_zmp(preview, zmp, zmp[0])
     pelvis = _pelvis_under(motion.com, np.tile(standing, (len(zmp), 1)), biped, ankles, timing.time)
     q = _angles(biped, pelvis, ankles, timing.time)
@@ -95,7 +97,7 @@ def plan_walk(gait: Gait, biped: Biped, control_period_s: float) -> WalkPlan:
     share = load_share(zmp, support_points(gait, biped.footholds))
     torque = _joint_torque(biped, ankles, q, dynamics, share)
     return WalkPlan(
-        gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height,
+        gait, timing, q, q_dot, q_ddot, zmp, dynamics.zmp, motion.com, motion.com_dot, com_height, biped.gravity,
         pelvis, ankles, share, torque,
     )  # fmt: skip
 

@@ -82,7 +82,7 @@ def ladder(lines: Lines, reference: str) -> Chart:
     ]  # fmt: skip
     layout["showlegend"] = False
     row = 24 if len(rungs) < 40 else 19
-    return Chart({"data": data, "layout": layout}, int(70 + row * (y + 1)), "")
+    return Chart({"data": data, "layout": layout}, int(70 + row * (y + 1)))
 
 
 def forest(rows: Sequence[Change]) -> Chart:
@@ -131,7 +131,7 @@ def forest(rows: Sequence[Change]) -> Chart:
     layout["yaxis"] = axis_of(
         range=[len(lines) - 0.4, -0.6], tickvals=list(range(len(lines))), ticktext=names, showgrid=False
     )
-    return Chart({"data": data, "layout": layout}, 80 + 27 * len(lines), "")
+    return Chart({"data": data, "layout": layout}, 80 + 27 * len(lines))
 
 
 _VERDICT_WORDS = {

@@ -21,7 +21,6 @@ from train.report.parts import (
     band_between,
     digits,
     domain,
-    faint,
     layout_of,
     nth,
     numbers,
@@ -75,7 +74,7 @@ def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:
             for begin, end in intervals(longest["single_support"], time)
         ]  # fmt: skip
     layout["margin"]["t"] = 28 + 20 * -(-sum(len(title) + 9 for title in cells) // 150)
-    return Chart({"data": data, "layout": layout}, 130 + 165 * len(signals), "")
+    return Chart({"data": data, "layout": layout}, 130 + 165 * len(signals))
 
 
 def sweep(lines: Lines, points: Mapping[str, Mapping[float | None, list[Evaluation]]], label: str) -> Chart:
@@ -115,7 +114,7 @@ def sweep(lines: Lines, points: Mapping[str, Mapping[float | None, list[Evaluati
     )  # fmt: skip
     layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0, "xanchor": "left"}
     layout["margin"]["t"] = 28 + 20 * -(-sum(len(title) + 9 for title in points) // 150)
-    return Chart({"data": data, "layout": layout}, height, "")
+    return Chart({"data": data, "layout": layout}, height)
 
 
 def learning(curves: Mapping[str, Curves], columns: Sequence[Column], colour: Mapping[str, str]) -> Chart:
@@ -132,7 +131,7 @@ def learning(curves: Mapping[str, Curves], columns: Sequence[Column], colour: Ma
             tallest = max(tallest, float(np.nanmax(ratio, initial=1.0)))
             x = [int(value) for value in found.decisions]
             if len(ratio) > 1:
-                data += band_between(x, low, high, colour[title], where, title)
+                data += band_between(low, high, colour[title], {**where, "x": x}, title)
             data.append({**where, "mode": "lines+markers", "x": x, "y": numbers(middle), "name": title,
                          "legendgroup": title, "showlegend": number == 0, "marker": {"size": 6},
                          "line": {"color": colour[title], "width": 2}})  # fmt: skip
@@ -147,7 +146,7 @@ def learning(curves: Mapping[str, Curves], columns: Sequence[Column], colour: Ma
     ]  # fmt: skip
     layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0, "xanchor": "left"}
     layout["showlegend"] = True
-    return Chart({"data": data, "layout": layout}, 400, "")
+    return Chart({"data": data, "layout": layout}, 400)
 
 
 def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: Signal, stride: int, where: Spec, first: bool
@@ -163,12 +162,7 @@ def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: Signal,
             "line": {"color": colour, "width": 1.5, "dash": dash}}  # fmt: skip
     if len(cell) < 2:
         return [line]
-    hidden = {**where, "legendgroup": title, "showlegend": False, "hoverinfo": "skip", "line": {"width": 0}}
-    return [
-        {**hidden, "y": numbers(low)},
-        {**hidden, "y": numbers(high), "fill": "tonexty", "fillcolor": faint(colour)},
-        line,
-    ]
+    return [*band_between(low, high, colour, where, title), line]
 
 
 def _sweep_lines(title: str, colour: str, own: Mapping[float | None, list[Evaluation]], values: Sequence[float],
@@ -190,7 +184,7 @@ def _sweep_lines(title: str, colour: str, own: Mapping[float | None, list[Evalua
         return [line]
     low = np.array([e.value if e.low is None else e.low for e in found])
     high = np.array([e.value if e.high is None else e.high for e in found])
-    return [*band_between(x, low, high, colour, where, title), line]
+    return [*band_between(low, high, colour, {**where, "x": x}, title), line]
 
 
 def _fall_marks(title: str, colour: str, own: Mapping[float | None, list[Evaluation]], values: Sequence[float],

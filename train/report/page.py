@@ -25,7 +25,7 @@ nav { display: flex; flex-wrap: wrap; gap: 4px 22px; padding: 12px 0; border-top
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 5px 22px; margin: 18px 0; font-size: 15px; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 ul { padding-left: 22px; max-width: 92ch; } li { margin: 4px 0; }
-figure { margin: 10px 0 26px; } figcaption { color: var(--soft); font-size: 14.5px; }
+figure { margin: 10px 0 26px; }
 .wide { overflow-x: auto; margin: 12px 0 22px; }
 table { border-collapse: collapse; font-size: 14px; width: 100%; font-variant-numeric: tabular-nums; }
 th { text-align: left; font-weight: 600; color: var(--soft); border-bottom: 1.5px solid var(--ink); padding: 6px 8px;
@@ -103,13 +103,12 @@ class Page:
         self._parts.append("<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>")
 
     def chart(self, chart: Chart, folded: str | None = None, is_open: bool = True) -> None:
-        """A chart with its caption; one that is folded away under a title is drawn when it is opened."""
+        """A chart; one that is folded away under a title is drawn when it is opened."""
         self._charts += 1
         name = f"c{self._charts}"
         spec = json.dumps(chart.spec, ensure_ascii=False, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
-        caption = f"<figcaption>{escape(chart.caption)}</figcaption>" if chart.caption else ""
         figure = (
-            f'<figure>{caption}<div class="chart" id="{name}" style="height:{chart.height}px"></div></figure>'
+            f'<figure><div class="chart" id="{name}" style="height:{chart.height}px"></div></figure>'
             f'<script type="application/json" id="{name}-spec">{spec}</script>'
         )
         self._parts.append(figure if folded is None else fold(folded, figure, is_open))

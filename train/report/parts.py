@@ -20,8 +20,6 @@ VERDICTS = {"lower": "#1a7f5a", "higher": "#b42318", "none": "#6e7781", "unclear
 """Colours of what a row shows."""
 LONGEST_NAME = 34
 """Letters of a policy that stand beside an axis."""
-_BEFORE_FALL_S = 0.6
-"""What happens in this time before a fall does not set the scale [s]."""
 
 Spec = dict[str, Any]
 
@@ -49,17 +47,15 @@ class Lines:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart with its caption.
+    """A chart.
 
     Attributes:
         spec: `data` and `layout` for plotly.js.
         height: Height [px].
-        caption: What it shows, as HTML.
     """
 
     spec: Spec
     height: int
-    caption: str
 
 
 def number_interval(estimate: Estimate, column: Column) -> str:
@@ -85,9 +81,9 @@ def error_bars(estimates: Sequence[Estimate], colour: str) -> Spec:
             "width": 5, "visible": any(e.has_interval for e in estimates)}  # fmt: skip
 
 
-def band_between(x: Sequence[float], low: Array, high: Array, colour: str, where: Spec, title: str) -> list[Spec]:
-    """The band between two curves."""
-    hidden = {**where, "x": list(x), "mode": "lines", "legendgroup": title, "showlegend": False, "hoverinfo": "skip",
+def band_between(low: Array, high: Array, colour: str, where: Spec, title: str) -> list[Spec]:
+    """The band between two curves, over the abscissa that `where` has."""
+    hidden = {**where, "mode": "lines", "legendgroup": title, "showlegend": False, "hoverinfo": "skip",
               "line": {"width": 0}}  # fmt: skip
     return [
         {**hidden, "y": numbers(low)},
@@ -99,8 +95,7 @@ def range_of(evaluations: Sequence[Evaluation], signal: Signal) -> list[float]:
     """Range of a signal and its reference, shortly before a fall left out."""
     found = []
     for e in evaluations:
-        kept = e.trace["time_s"] <= e.trace["time_s"][-1] - (_BEFORE_FALL_S if e.first_failed else 0.0)
-        found += [e.trace[name][kept] for name in (signal.name, signal.reference) if name is not None]
+        found += [e.trace[name][e.is_steady] for name in (signal.name, signal.reference) if name is not None]
     values = np.concatenate(found)
     values = signal.scale * values[np.isfinite(values)]
     if len(values) == 0:

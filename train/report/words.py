@@ -148,7 +148,7 @@ def marked(row: Change) -> str:
 
 def notes(results: Results) -> list[str]:
     """What a reader needs to know, and only what concerns this comparison."""
-    failure = "falls" if results.lines.environment.failure == "falls" else "failures"
+    failure = results.lines.environment.failures
     notes = [
         "A change is, per training seed, the mean over episodes with the residual over the mean over the same "
         "episodes of its base, minus one. An episode in which either did not reach the end is left out of both and "

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from elastic_env.errors import missing_extra
 from train.evaluate import Evaluation
+from train.figures import MIN_SWEPT_REFERENCES
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
 from train.report.markdown import markdown
 from train.report.page import Page, changes_html, definitions, fold, table
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
 
-MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
 _LONG = 40
 """Rows from which on a table is folded away."""
@@ -142,7 +142,7 @@ def _add_sweeps(page: Page, results: Results) -> None:
                     t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
                 }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
-    elif len({_number(e) for e in results.evaluations} - {None}) >= MIN_SWEPT_REFERENCES:
+    elif len({e.condition.number for e in results.evaluations} - {None}) >= MIN_SWEPT_REFERENCES:
         for scenario in lines.scenarios:
             points = {t: _by_number(lines.cell(t, scenario=scenario)) for t in lines.titles}
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
@@ -168,13 +168,7 @@ def _by_option(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Eva
 def _by_number(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Evaluation]]:
     found: dict[float | None, list[Evaluation]] = {}
     for e in evaluations:
-        number = _number(e)
+        number = e.condition.number
         if number is not None:
             found.setdefault(number, []).append(e)
     return found
-
-
-def _number(evaluation: Evaluation) -> float | None:
-    """What of a reference scores can be drawn against."""
-    condition = evaluation.condition
-    return next(iter(condition.environment.abscissa(condition.reference).values()), None)

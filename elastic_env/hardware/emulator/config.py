@@ -25,7 +25,6 @@ class EmulatorConfig(Model):
     """The joints behind them, and through its scenario the quality of the IMU."""
     imu_rate_hz: float = quantity("Hz", 100.0, gt=0, le=1000, description="packets of the IMU per second")
     baudrate: int = quantity("bit/s", 3_000_000, gt=0, description="rate of the bus; no other is heard")
-    return_delay_s: float = quantity("s", 0.0, ge=0, lt=1e-3, description="delay before each reply, as it is set")
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
 

@@ -2,7 +2,7 @@
 
     75 65  set  length  [field length  field  data ...] ...  checksum (2)
 
-Numbers are big endian; the checksum is Fletcher's, both sums modulo 256 (maker's SDK; facts in docs/hardware.md).
+Numbers are big endian; the checksum is Fletcher's, both sums modulo 256 (as the maker's SDK has it).
 """
 
 import struct

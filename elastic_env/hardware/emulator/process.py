@@ -191,7 +191,7 @@ class Emulator:
     def _queue(self, replies: list[bytes], now: float) -> None:
         for reply in replies:
             sent, delay = damage(self.faults, reply, self._line)
-            wire_s = self.config.return_delay_s + 10.0 * len(reply) / self.config.baudrate
+            wire_s = 10.0 * len(reply) / self.config.baudrate
             begin = max(now + delay, self._replies[-1][0] if self._replies else now)
             if sent:
                 self._replies.append((begin + wire_s, sent))
