@@ -392,7 +392,10 @@ class WalkTask:
 
     def _watch_swing_foot(self) -> None:
         """Since when the swing foot has been on the ground in the second half of its swing."""
-        half, foot = self._half_of_swing.take(self._now), self._swing_foot.take(self._now)
+        half = self._half_of_swing.take(self._now)
+        if not half.any():  # worlds that were started together all stand on two feet, most of the time
+            return
+        foot = self._swing_foot.take(self._now)
         loaded = self._state.force[self._each, foot] > UNLOADED_SHARE * self._weight
         first = (half == SECOND_HALF) & loaded & (self._contact_since < 0)
         since = np.where(first, self._step, self._contact_since)
