@@ -1,16 +1,24 @@
 """Parameter models and YAML files: what is wrong must be named, with what would be right."""
 
+import re
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from baselines.correction import ResidualSettings
+from baselines.policies import PolicyOptions
 from elastic_env.config import Model, load_yaml, parse_yaml, quantity
+from elastic_env.entry_points import configure_testbed, configure_walk
 from elastic_env.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
 from elastic_env.tasks.testbed_config import TestbedConfig
+from train.compare import CompareConfig
+from train.train_config import TrainConfig
 
-CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+ROOT = Path(__file__).parents[1]
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 
 
 class Inner(Model):
@@ -235,3 +243,16 @@ def test_every_parameter_has_a_unit_or_is_no_number() -> None:
         return missing
 
     assert numbers_without_unit(TestbedConfig, {TestbedConfig}) == []
+
+
+def test_every_option_is_documented() -> None:
+    """Catches an argument or a key that docs/options.md does not have, or that it has and nothing takes."""
+    arguments = {*signature(configure_testbed).parameters, *signature(configure_walk).parameters}
+    keys = {
+        name for model in (PolicyOptions, CompareConfig, TrainConfig, ResidualSettings) for name in model.model_fields
+    }
+    text = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
+    quoted = set(re.findall(r"`(\w+)`", text))
+    assert arguments | keys <= quoted
+    first_cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    assert {name for cell in first_cells for name in re.findall(r"`(\w+)`", cell)} <= arguments | keys
