@@ -705,24 +705,45 @@ def _write_and_fail(path: Path) -> None:
     raise ZeroDivisionError
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_comparison_that_ends_takes_its_workers_with_it(tmp_path: Path, how: signal.Signals) -> None:
-    """Catches Ctrl-C that is ignored until all is done, and workers that go on without their parent.
+_SLOW_IMPORT = """
+import sys, time
 
-    SIGINT reaches the whole process group, as from a terminal; SIGKILL the parent alone.
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "train.workers" and "--multiprocessing-fork" in sys.orig_argv:
+            time.sleep({})
+
+sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "import_s", "wait_s"), [(signal.SIGINT, 2.0, 1.0), (signal.SIGINT, 0.0, 2.0), (signal.SIGKILL, 0.0, 2.0)]
+)
+def test_a_comparison_that_ends_takes_its_workers_with_it(
+    tmp_path: Path, how: signal.Signals, import_s: float, wait_s: float
+) -> None:
+    """Catches Ctrl-C that is ignored until all is done, that workers answer with tracebacks, and workers that go on.
+
+    The workers import for `import_s` longer than they need. SIGINT reaches the whole process group, as from a terminal,
+    the parent last; SIGKILL the parent alone.
     """
+    (tmp_path / "sitecustomize.py").write_text(_SLOW_IMPORT.format(import_s))
     policies = [{"name": name, "label": f"{name} {n}"} for n in range(3) for name in ("zero", "input")]
     (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": policies}))
     process = subprocess.Popen(
         [sys.executable, "-c", "from train.cli import main; main()", "compare", "long.yaml"],
         cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
     )  # fmt: skip
     deadline = time.monotonic() + 60.0
-    while len(_members(process.pid)) < 4 and time.monotonic() < deadline:  # parent, manager, two workers
-        time.sleep(0.2)
-    time.sleep(2.0)
+    while len(_members(process.pid)) < 5 and time.monotonic() < deadline:  # parent, tracker, manager, two workers
+        time.sleep(0.05)
+    time.sleep(wait_s)
     if how is signal.SIGINT:
-        os.killpg(process.pid, how)
+        for member in sorted(_members(process.pid), key=lambda member: member == process.pid):
+            os.kill(member, how)
+            time.sleep(0.1)
         output, _ = process.communicate(timeout=20)
         assert process.returncode == 130, output
         assert "Traceback" not in output

@@ -7,6 +7,8 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.managers import SyncManager
 from typing import Any
 
@@ -73,12 +75,14 @@ def side_by_side(
     jobs = min(jobs or os.cpu_count() or 1, len(arguments))
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
-    manager.start(_follow_parent)
+    with _ctrl_c_held():
+        manager.start(_follow_parent)
     with manager:
         reports = manager.Queue()
         pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_follow_parent)
         try:
-            futures = [pool.submit(_call, function, given, n, reports) for n, given in enumerate(arguments)]
+            with _ctrl_c_held():
+                futures = [pool.submit(_call, function, given, n, reports) for n, given in enumerate(arguments)]
             while not all(future.done() for future in futures):
                 for number, value in _drain(reports):
                     report(number, value)
@@ -113,6 +117,20 @@ def progress_bar(console: Console, transient: bool = False) -> Progress:
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         console=console, transient=transient,
     )  # fmt: skip
+
+
+@contextmanager
+def _ctrl_c_held() -> Iterator[None]:
+    """Keep SIGINT waiting while processes are started: they begin with it blocked, as the parent is then.
+
+    Else it could end them, with a traceback each, in the second in which they import and cannot yet ignore it.
+    """
+    resource_tracker.ensure_running()  # its own start would let SIGINT through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _follow_parent() -> None:
