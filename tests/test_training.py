@@ -218,6 +218,20 @@ def test_a_mixture_is_its_parts() -> None:
     np.testing.assert_array_equal(observation[:2], again)
 
 
+def test_rewards_of_a_scenario_count_by_its_weight() -> None:
+    """Catches weights that nothing reads, or of another scenario."""
+    config = TrainConfig(**{**SMALL, "scenarios": ["nominal", "soft"], "worlds": 4})
+    rewards = []
+    for weights in ({}, {"soft": 0.25}):
+        weighted = config.replace(weights=weights)
+        worlds = training_worlds(weighted, weighted.shares, 1)
+        worlds.reset(seed=3)
+        residual = np.full(worlds.action_space.shape, 0.5)
+        rewards.append(np.sum([worlds.step(residual)[1] for _ in range(40)], axis=0))
+    np.testing.assert_allclose(rewards[1], rewards[0] * [1.0, 1.0, 0.25, 0.25], rtol=1e-12)
+    assert np.abs(rewards[0]).min() > 0.0
+
+
 def test_spread_worlds_stand_all_over_the_walk() -> None:
     """Catches worlds that begin together, so that every batch shows one phase."""
     env = wrapped("walker", 6, base="input_output")
@@ -290,6 +304,8 @@ def test_train_command_trains_every_seed_and_resumes(
         ({"worlds": 3, "scenarios": ["nominal", "soft"]}, "two per scenario, 4, got 3"),
         ({"base": "inptu"}, "'inptu'.*input"),
         ({"scenarios": ["sotf"]}, "'sotf'.*soft"),
+        ({"weights": {"soft": 2.0}}, r"learned from, \['nominal'\], got 'soft'"),
+        ({"weights": {"nominal": -1.0}}, "greater than 0"),
         ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
         ({"base": "zero"}, "compensates none; use space 'joint'"),
     ],

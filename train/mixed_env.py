@@ -23,12 +23,18 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     Args:
         envs: With equal spaces, such as `ResidualVectorWrapper`s of the same settings in different scenarios.
         num_threads: Environments that step at a time, 0 for as many as there are cores.
+        weights: Factor of each environment's rewards; None for equal ones.
 
     Raises:
         ConfigurationError: None, spaces that differ, or another autoreset mode.
     """
 
-    def __init__(self, envs: Sequence[gymnasium.vector.VectorEnv[Any, Any, Any]], num_threads: int = 0) -> None:
+    def __init__(
+        self,
+        envs: Sequence[gymnasium.vector.VectorEnv[Any, Any, Any]],
+        num_threads: int = 0,
+        weights: Sequence[float] | None = None,
+    ) -> None:
         if not envs:
             raise ConfigurationError("a mixture needs at least one environment")
         for env in envs:
@@ -48,6 +54,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         ends = np.cumsum([env.num_envs for env in envs]).tolist()
+        self._weights = np.repeat([1.0] * len(envs) if weights is None else weights, [env.num_envs for env in envs])
         self._worlds = [slice(end - env.num_envs, end) for env, end in zip(envs, ends, strict=True)]
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -78,7 +85,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         observation, reward, terminated, truncated = (
             np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
         )
-        return observation, reward, terminated, truncated, self._info([result[4] for result in results])
+        return observation, self._weights * reward, terminated, truncated, self._info([result[4] for result in results])
 
     def close(self, **kwargs: Any) -> None:
         """Close all environments."""

@@ -1,9 +1,9 @@
 """What is trained on what: the configuration of a training, and the worlds that it learns from."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from gymnasium.vector import AutoresetMode
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 import baselines
 from baselines.correction import ResidualSettings
@@ -33,6 +33,8 @@ class TrainConfig(Model):
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: list[str] = Field(default=["nominal"], min_length=1)
     """Scenarios whose worlds are learned from together, in equal shares."""
+    weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = {}
+    """How much the rewards of single scenarios count; 1 where nothing is said."""
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
     base: str = "input_output"
@@ -57,6 +59,13 @@ class TrainConfig(Model):
     checkpoint_every: int = quantity("1", 10_000, ge=1, description="decisions between checkpoints")
 
     _checked = field_validator("base")(require_plain_base)
+
+    @model_validator(mode="after")
+    def _weights_are_of_scenarios(self) -> Self:
+        for name in self.weights:
+            if name not in self.scenarios:
+                raise ValueError(f"weights must be of scenarios that are learned from, {self.scenarios}, got {name!r}")
+        return self
 
     @property
     def motion(self) -> Any:
@@ -120,4 +129,4 @@ def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads:
         env = make_vector_env(condition.replace(env_options=apart), worlds, own, AutoresetMode.SAME_STEP)
         base = baselines.make(config.base, env, **config.base_options)
         wrapped.append(ResidualVectorWrapper(env, base, **config.settings.model_dump()))
-    return MixedVectorEnv(wrapped, threads)
+    return MixedVectorEnv(wrapped, threads, [config.weights.get(scenario, 1.0) for scenario, _ in shares])
