@@ -191,9 +191,9 @@ class Training(Trainer):
             buffer.pos, buffer.full = state["replay_at"]
 
     def _portion(self) -> int:
-        """Decisions of one call of `learn`: an iteration of PPO, a thousand or so of SAC."""
-        steps = getattr(self.model, "n_steps", None)
-        return self.config.worlds * (steps if steps is not None else max(1024 // self.config.worlds, 1))
+        """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on to its next update."""
+        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)  # whose n_steps are those of its returns
+        return self.config.worlds * (1 if is_off_policy else self.model.n_steps)
 
     def _shrink_last_layer(self) -> None:
         """A residual begins near zero: as the base."""
