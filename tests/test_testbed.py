@@ -15,15 +15,14 @@ from hypothesis import strategies as st
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.elasticity import Servo
-from elastic_env.entry_points import make_testbed, make_testbed_vector, make_walk_vector
+from elastic_env.entry_points import make_testbed, make_testbed_vector
 from elastic_env.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.errors import ActionError, ConfigurationError
 from elastic_env.plan import STAND_S
 from elastic_env.references import Hold, Sine
 from elastic_env.robots.dynamixel import ENCODER_COUNTS_PER_TURN, H54_200_S500_R
 from elastic_env.robots.testbed import Pendulum
-from elastic_env.scenario import Scenario, make_scenario, scenario_names
-from elastic_env.sensors import AttitudeSensor
+from elastic_env.scenario import make_scenario, scenario_names
 from elastic_env.signals import Array
 from elastic_env.tasks import testbed
 from elastic_env.tasks.testbed_config import TestbedConfig
@@ -838,52 +837,6 @@ def test_a_reference_without_a_scored_step_is_an_error() -> None:
     """Catches metrics that are nan without a word."""
     with pytest.raises(ConfigurationError, match="no scored control step"):
         make_testbed(reference={"kind": "sine", "duration_s": 1e-3})
-
-
-@pytest.mark.parametrize("scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"])
-def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) -> None:
-    """Catches a ceiling that is none, and identical episodes that count as many."""
-    envs = [
-        gymnasium.make("elastic_env/Testbed-v0", scenario=scenario, reference="sine", observe_link=True)
-        for _ in range(2)
-    ]
-    runs = []
-    for seed, env in enumerate(envs):
-        seen = [env.reset(seed=seed)[0]]
-        seen += [env.step(np.full(1, 0.01, np.float32))[0] for _ in range(300)]
-        runs.append(np.array(seen))
-    assert make_scenario(scenario).is_random == (not np.array_equal(*runs))
-
-
-@pytest.mark.parametrize(
-    "alone",
-    [
-        {"pelvis_imu": AttitudeSensor(noise_rad=1e-3)}, {"pelvis_imu": AttitudeSensor(bias_spread_rad=1e-3)},
-        {"gyro_noise_rad_s": 1e-3}, {"force_noise_n": 1.0}, {"moment_noise_nm": 0.1}, {"encoder_bias_rad": 1e-3},
-        {"stiffness_spread": 0.3}, {"slope_rad": 0.01}, {"delay_steps": 1},
-        {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)},
-    ],
-    ids=lambda alone: "-".join(alone),
-)  # fmt: skip
-def test_whatever_a_walk_draws_makes_its_scenario_random(alone: dict[str, Any]) -> None:
-    """Catches a kind of noise or a drawn robot that is forgotten where ceilings are told from samples."""
-    scenario = Scenario(friction_scale=0.0, encoder_counts=False, **alone)
-    env = make_walk_vector(num_envs=2, scenario=scenario)
-    env.reset(seed=[0, 1])
-    seen = np.array([env.step(np.zeros((2, 12), np.float32))[0] for _ in range(5)])
-    assert scenario.is_random == (not np.array_equal(seen[:, 0], seen[:, 1]))
-
-
-def test_an_imu_alone_makes_a_scenario_of_the_testbed_random() -> None:
-    """Catches its sensor forgotten."""
-    assert Scenario(imu=AttitudeSensor(noise_rad=1e-3)).is_random
-    assert not Scenario(imu=AttitudeSensor(bias_rad=1e-3)).is_random
-
-
-def test_pushes_are_drawn() -> None:
-    """Catches a walker's condition taken for one and the same walk."""
-    assert make_scenario("ideal+push").is_random
-    assert not make_scenario("ideal+stiff").is_random
 
 
 def test_a_shorter_physics_step_changes_little() -> None:

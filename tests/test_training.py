@@ -230,6 +230,8 @@ def test_rewards_of_a_scenario_count_by_its_weight() -> None:
         rewards.append(np.sum([worlds.step(residual)[1] for _ in range(40)], axis=0))
     np.testing.assert_allclose(rewards[1], rewards[0] * [1.0, 1.0, 0.25, 0.25], rtol=1e-12)
     assert np.abs(rewards[0]).min() > 0.0
+    with pytest.raises(ConfigurationError, match=r"one per environment, 1, got \[1.0, 2.0\]"):
+        MixedVectorEnv([wrapped(n=2)], weights=[1.0, 2.0])
 
 
 def test_spread_worlds_stand_all_over_the_walk() -> None:

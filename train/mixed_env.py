@@ -26,7 +26,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         weights: Factor of each environment's rewards; None for equal ones.
 
     Raises:
-        ConfigurationError: None, spaces that differ, or another autoreset mode.
+        ConfigurationError: None, spaces that differ, another autoreset mode, or not one weight per environment.
     """
 
     def __init__(
@@ -45,6 +45,9 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
                 envs[0].single_action_space,
             ):
                 raise ConfigurationError("all environments of a mixture must have the same spaces")
+        factors = [1.0] * len(envs) if weights is None else list(weights)
+        if len(factors) != len(envs):
+            raise ConfigurationError(f"weights must be one per environment, {len(envs)}, got {factors}")
         self.envs = list(envs)
         self._threads = ThreadPoolExecutor(min(num_threads or os.cpu_count() or 1, len(envs)))
         self.num_envs = sum(env.num_envs for env in envs)
@@ -54,7 +57,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         ends = np.cumsum([env.num_envs for env in envs]).tolist()
-        self._weights = np.repeat([1.0] * len(envs) if weights is None else weights, [env.num_envs for env in envs])
+        self._weights = np.repeat(factors, [env.num_envs for env in envs])
+        self._weights.flags.writeable = False  # no state
         self._worlds = [slice(end - env.num_envs, end) for env, end in zip(envs, ends, strict=True)]
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
