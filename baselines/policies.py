@@ -74,6 +74,8 @@ def _open(build: Builder) -> Builder:
 
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    if not hasattr(env.unwrapped, "truth"):
+        raise ConfigurationError("the oracle needs the truth of one environment, a mixture of scenarios has several")
     if isinstance(model, WalkerModel):
         controller = _controller(env, env.unwrapped.truth().model, options)
         return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)

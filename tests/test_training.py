@@ -16,17 +16,19 @@ import pytest
 import yaml
 from gymnasium.vector import AutoresetMode
 
+import baselines
 from baselines.residual import load_residual
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 from train.cli import main
 from train.constant_search import ConstantSearch
-from train.evaluate import make_vector_env
+from train.evaluate import evaluate, make_vector_env
 from train.learn import Training
 from train.mixed_env import MixedVectorEnv
 from train.progress import read_progress
 from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv
+from train.scores import played_together
 from train.state import capture, read_state, restore, write_state
 from train.train_config import TrainConfig, training_worlds
 
@@ -40,17 +42,26 @@ PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}, "an
 SAC = {"algorithm": "SAC", "algorithm_options": {"learning_starts": 32, "batch_size": 16, "gradient_steps": 1}}
 
 
+def some_worlds(robot: str = "testbed", n: int = 3, scenario: str = "nominal", **options: Any) -> Any:
+    """A few worlds that nobody restarts."""
+    name = "elastic_env/Testbed-v0" if robot == "testbed" else "elastic_env/WalkInPlace-v0"
+    motion = {"reference": SINE} if robot == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
+    return gymnasium.make_vec(
+        name, num_envs=n, vectorization_mode="vector_entry_point", scenario=scenario,
+        **{"autoreset_mode": AutoresetMode.DISABLED, **motion, **options},
+    )  # fmt: skip
+
+
+def under_residuals(env: Any, base: str = "input") -> ResidualVectorWrapper:
+    """Residuals in worlds that restart in the step in which they end."""
+    return ResidualVectorWrapper(env, base, history=1, decision_period=10, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
 def wrapped(
     robot: str = "testbed", n: int = 3, scenario: str = "nominal", base: str = "input"
 ) -> ResidualVectorWrapper:
-    """Residuals of a few worlds."""
-    name = "elastic_env/Testbed-v0" if robot == "testbed" else "elastic_env/WalkInPlace-v0"
-    motion = {"reference": SINE} if robot == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
-    env = gymnasium.make_vec(
-        name, num_envs=n, vectorization_mode="vector_entry_point", autoreset_mode=AutoresetMode.SAME_STEP,
-        scenario=scenario, **motion,
-    )  # fmt: skip
-    return ResidualVectorWrapper(env, base, history=1, decision_period=10)
+    """Residuals in a few worlds."""
+    return under_residuals(some_worlds(robot, n, scenario), base)
 
 
 def weights(folder: Path) -> dict[str, Array]:
@@ -156,8 +167,8 @@ def test_worlds_go_on_from_a_state_in_files(robot: str, tmp_path: Path) -> None:
     base = "input" if robot == "testbed" else "dynamic"
 
     def made() -> SB3VecEnv:
-        mixture = [wrapped(robot, 2, scenario, base) for scenario in ("sensor", "nominal")]
-        return SB3VecEnv(MixedVectorEnv(mixture), np.random.default_rng(0))
+        mixture = MixedVectorEnv([some_worlds(robot, 2, scenario) for scenario in ("sensor", "nominal")])
+        return SB3VecEnv(under_residuals(mixture, base), np.random.default_rng(0))
 
     generator = np.random.default_rng(1)
     one, other = made(), made()
@@ -193,7 +204,7 @@ def test_a_state_of_something_else_is_refused() -> None:
 def test_a_mixture_is_its_parts() -> None:
     """Catches worlds that get another's action, seed or end."""
     parts = [wrapped(n=2), wrapped(n=1, scenario="soft")]
-    whole = MixedVectorEnv([wrapped(n=2), wrapped(n=1, scenario="soft")])
+    whole = under_residuals(MixedVectorEnv([some_worlds(n=2), some_worlds(n=1, scenario="soft")]))
     observation, _ = whole.reset(seed=7)
     alone = np.concatenate([parts[0].reset(seed=7)[0], parts[1].reset(seed=9)[0]])
     np.testing.assert_array_equal(observation, alone)
@@ -231,7 +242,42 @@ def test_rewards_of_a_scenario_count_by_its_weight() -> None:
     np.testing.assert_allclose(rewards[1], rewards[0] * [1.0, 1.0, 0.25, 0.25], rtol=1e-12)
     assert np.abs(rewards[0]).min() > 0.0
     with pytest.raises(ConfigurationError, match=r"one per environment, 1, got \[1.0, 2.0\]"):
-        MixedVectorEnv([wrapped(n=2)], weights=[1.0, 2.0])
+        MixedVectorEnv([some_worlds(n=2)], weights=[1.0, 2.0])
+
+
+def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
+    """Catches worlds whose observation, length or assumed robot differs from what the policy was made for."""
+    one = some_worlds(n=1)
+    with pytest.raises(ConfigurationError, match=r"at least one environment"):
+        MixedVectorEnv([])
+    with pytest.raises(ConfigurationError, match=r"must have autoreset_mode Disabled"):
+        MixedVectorEnv([one, some_worlds(n=1, autoreset_mode=AutoresetMode.NEXT_STEP)])
+    for other in (some_worlds("walker", 1), some_worlds(n=1, reference={**SINE, "duration_s": 2.0})):
+        with pytest.raises(ConfigurationError, match=r"the same task and motion"):
+            MixedVectorEnv([one, other])
+    for pair in ([one, some_worlds(n=1, stiffness=900.0)], [some_worlds("walker", 1, x) for x in ("ideal", "soft")]):
+        with pytest.raises(ConfigurationError, match=r"assume the same joints; .* keep them apart"):
+            MixedVectorEnv(pair)
+    with pytest.raises(ConfigurationError, match=r"oracle .* one environment"):
+        baselines.make("oracle", MixedVectorEnv([one]))
+
+
+@pytest.mark.parametrize("env", ["testbed", "walker"])
+def test_episodes_played_together_score_as_alone(env: str) -> None:
+    """Catches scores of another world, episode, scenario or policy, and a fall that counts as a score."""
+    motion: Any = SINE if env == "testbed" else {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
+    base = "input" if env == "testbed" else "uncompensated"
+    metric = "link_error_rms_rad" if env == "testbed" else "pelvis_error_rms_rad"
+    config = TrainConfig(env=env, reference=motion, scenarios=["soft", "nominal", "sensor"], base=base)
+    conditions = [
+        config.condition(scenario, base).replace(episodes=n)
+        for scenario, n in zip(config.scenarios, (2, 1, 3), strict=True)
+    ]
+    for (values, failed), condition in zip(played_together(conditions, [metric]), conditions, strict=True):
+        alone = evaluate(condition, num_threads=1)
+        assert values.shape == (condition.episodes, 1)
+        assert failed.sum() == alone.num_failed
+        np.testing.assert_array_equal(values[~failed, 0], alone.values(metric))
 
 
 def test_spread_worlds_stand_all_over_the_walk() -> None:
@@ -248,27 +294,28 @@ def test_spread_worlds_stand_all_over_the_walk() -> None:
 
 def test_training_seeds_and_evaluation_seeds_are_disjoint(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Catches a policy that is scored on episodes that it learned from."""
-    seen: dict[str, list[Any]] = {"training": []}
+    seen: list[Any] = []
     reset = MixedVectorEnv.reset
 
     def spied(self: MixedVectorEnv, *, seed: Any = None, options: Any = None) -> Any:
-        seen["training"].append(seed)
+        seen.append(seed)
         return reset(self, seed=seed, options=options)
 
     monkeypatch.setattr(MixedVectorEnv, "reset", spied)
     config = TrainConfig(**{**SMALL, **PPO, "decisions": 32})
     for seed in (0, 1):
         Training(config, seed, tmp_path / str(seed)).run()
-    trained = {one for seeds in seen["training"] if seeds is not None for one in seeds}
+    evaluated = config.condition("nominal", "input").seed
+    trained = {one for seeds in seen if seeds is not None for one in seeds} - {evaluated}
     assert len(trained) == 8
-    evaluated = config.condition("nominal", "input")
-    assert max(range(evaluated.seed, evaluated.seed + 1_000)) < min(trained)
+    assert [evaluated] in seen
+    assert evaluated + 1_000 < min(trained)
 
 
 def test_residuals_learn_from_other_robots_than_they_are_evaluated_with() -> None:
     """Catches a score on robots that training has seen."""
     config = TrainConfig(env="walker", scenarios=["spread"], worlds=2)
-    learned_from: Any = training_worlds(config, config.shares, 1).envs[0].unwrapped
+    learned_from: Any = training_worlds(config, config.shares, 1).unwrapped.envs[0]
     evaluated: Any = make_vector_env(config.condition("spread", config.base), 2, 1).unwrapped
     assert not set(learned_from.task._bank) & set(evaluated.task._bank)
 

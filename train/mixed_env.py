@@ -1,7 +1,7 @@
-"""Several vector environments as one: worlds of different scenarios that one agent learns from."""
+"""Several vector environments as one: worlds of different scenarios under one policy."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -11,22 +11,28 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from elastic_env.errors import ConfigurationError
+from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array, BoolArray
+from elastic_env.tasks.task import Task
+from train.conditions import Condition
+from train.evaluate import make_vector_env
 
 
 class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """The worlds of several vector environments with same-step autoreset, one environment's after the other's.
+    """The worlds of several vector environments, one environment's after the other's.
 
-    They step side by side on threads: while the physics of one runs without Python, another's policy runs in it. Give
-    each one thread of physics then; the results do not depend on it.
+    A policy costs hardly more for all of them than for those of one. The environments step side by side on threads,
+    while the physics of one runs without Python: give each one thread of physics. The results do not depend on it.
+
+    Worlds that end are begun anew by who wraps this, with options["reset_mask"].
 
     Args:
-        envs: With equal spaces, such as `ResidualVectorWrapper`s of the same settings in different scenarios.
+        envs: Vector environments of ours with `autoreset_mode=DISABLED`, of the same task in different scenarios.
         num_threads: Environments that step at a time, 0 for as many as there are cores.
         weights: Factor of each environment's rewards; None for equal ones.
 
     Raises:
-        ConfigurationError: None, spaces that differ, another autoreset mode, or not one weight per environment.
+        ConfigurationError: None, different tasks, another autoreset mode, or not one weight per environment.
     """
 
     def __init__(
@@ -37,29 +43,45 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> None:
         if not envs:
             raise ConfigurationError("a mixture needs at least one environment")
-        for env in envs:
-            if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
-                raise ConfigurationError("all environments of a mixture must have autoreset_mode SameStep")
-            if (env.single_observation_space, env.single_action_space) != (
-                envs[0].single_observation_space,
-                envs[0].single_action_space,
-            ):
-                raise ConfigurationError("all environments of a mixture must have the same spaces")
+        self.envs: list[Any] = [env.unwrapped for env in envs]
+        for env in self.envs:
+            if env.autoreset_mode is not AutoresetMode.DISABLED:
+                raise ConfigurationError("all environments of a mixture must have autoreset_mode Disabled")
+            if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
+                raise ConfigurationError("all environments of a mixture must have the same task and motion")
+            if env.assumed_model.joints != self.assumed_model.joints:
+                raise ConfigurationError(
+                    "all environments of a mixture must let a policy assume the same joints; the scenarios with "
+                    '"ideal" assume no friction, the others do: keep them apart'
+                )
         factors = [1.0] * len(envs) if weights is None else list(weights)
         if len(factors) != len(envs):
             raise ConfigurationError(f"weights must be one per environment, {len(envs)}, got {factors}")
-        self.envs = list(envs)
         self._threads = ThreadPoolExecutor(min(num_threads or os.cpu_count() or 1, len(envs)))
-        self.num_envs = sum(env.num_envs for env in envs)
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        sizes = [env.num_envs for env in envs]
+        ends = np.cumsum(sizes).tolist()
+        self._worlds = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+        self._weights = np.repeat(factors, sizes)
+        self._weights.flags.writeable = False  # no state
+        self.num_envs = ends[-1]
+        self.autoreset_mode = AutoresetMode.DISABLED
+        self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = envs[0].single_observation_space
         self.single_action_space = envs[0].single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        ends = np.cumsum([env.num_envs for env in envs]).tolist()
-        self._weights = np.repeat(factors, [env.num_envs for env in envs])
-        self._weights.flags.writeable = False  # no state
-        self._worlds = [slice(end - env.num_envs, end) for env, end in zip(envs, ends, strict=True)]
+
+    @property
+    def assumed_model(self) -> RobotModel:
+        """What a compensator may know of the robot; the same in all environments."""
+        model: RobotModel = self.envs[0].assumed_model
+        return model
+
+    @property
+    def task(self) -> Task:
+        """The rules of the first environment, whose length and observation are those of all."""
+        task: Task = self.envs[0].task
+        return task
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every world, or in those of options["reset_mask"].
@@ -67,50 +89,65 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         World i gets seed + i, or the i-th of a list of seeds.
         """
         seeds: Any = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
-        mask = None if options is None else options.get("reset_mask")
-        observations = []
-        for env, worlds in zip(self.envs, self._worlds, strict=True):
-            own: Any = None if seeds is None else list(seeds[worlds])
-            chosen = options if mask is None else {**(options or {}), "reset_mask": np.asarray(mask)[worlds]}
-            observations.append(env.reset(seed=own, options=chosen)[0])
-        return np.concatenate(observations), {}
+        mask: BoolArray = np.ones(self.num_envs, dtype=np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
 
-    def spread(self, observation: Array, generator: np.random.Generator) -> Array:
-        """Spread the worlds of every environment over the episode, see `ResidualVectorWrapper.spread`."""
-        own = generator.spawn(len(self.envs))
-        parts = [observation[worlds] for worlds in self._worlds]
-        spread: Any = self._threads.map(lambda env, part, mine: env.spread(part, mine), self.envs, parts, own)
-        return np.concatenate(list(spread))
+        def begun(env: Any, worlds: slice) -> Array:
+            if not mask[worlds].any():
+                return np.asarray(env.task.observe())
+            own = None if seeds is None else list(seeds[worlds])
+            return np.asarray(env.reset(seed=own, options={"reset_mask": mask[worlds]})[0])
+
+        return np.concatenate(self._side_by_side(begun)), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One step in every world; the infos are those of worlds that end."""
-        parts = [actions[worlds] for worlds in self._worlds]
-        results = list(self._threads.map(lambda env, part: env.step(part), self.envs, parts))
+        """One step in every world; the info is that of worlds that end: `termination` and `episode_metrics`."""
+        results = self._side_by_side(lambda env, worlds: env.step(actions[worlds]))
         observation, reward, terminated, truncated = (
             np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
         )
-        return observation, self._weights * reward, terminated, truncated, self._info([result[4] for result in results])
+        ended = terminated | truncated
+        info = self._info([result[4] for result in results], ended) if ended.any() else {}
+        return observation, self._weights * reward, terminated, truncated, info
 
-    def close(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         """Close all environments."""
         self._threads.shutdown()
         for env in self.envs:
             env.close(**kwargs)
 
-    def _info(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
-        ended = [
-            info.get("_final_info", np.zeros(env.num_envs, bool)) for info, env in zip(infos, self.envs, strict=True)
-        ]
-        mask: BoolArray = np.concatenate(ended)
-        if not mask.any():
-            return {}
-        final_obs = np.full(self.num_envs, None, dtype=object)
+    def _side_by_side(self, function: Callable[[Any, slice], Any]) -> list[Any]:
+        return list(self._threads.map(function, self.envs, self._worlds))
+
+    def _info(self, infos: list[dict[str, Any]], ended: BoolArray) -> dict[str, Any]:
         metrics: dict[str, Array] = {}
-        for info, worlds, some in zip(infos, self._worlds, ended, strict=True):
-            if some.any():
-                final_obs[worlds] = info["final_obs"]
-                for name, values in info["final_info"]["episode_metrics"].items():
-                    whole = metrics.setdefault(name, np.zeros(self.num_envs, dtype=np.asarray(values).dtype))
+        for info, worlds in zip(infos, self._worlds, strict=True):
+            if ended[worlds].any():
+                for name, values in info["episode_metrics"].items():
+                    whole = metrics.setdefault(name, np.zeros(self.num_envs, dtype=values.dtype))
                     whole[worlds] = values
-        final_info = {"episode_metrics": metrics, "_episode_metrics": mask}
-        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask}
+        termination = np.concatenate([info["termination"] for info in infos])
+        return {"termination": termination, "episode_metrics": metrics, "_episode_metrics": ended}
+
+
+def mixed_env(
+    conditions: Sequence[Condition], sizes: Sequence[int], num_threads: int = 0, weights: Sequence[float] | None = None
+) -> MixedVectorEnv:
+    """Worlds of several conditions.
+
+    Args:
+        conditions: Cells of one environment and motion; their policies are not used.
+        sizes: Worlds of each.
+        num_threads: Threads of the physics, 0 for as many as there are cores.
+        weights: Factor of each one's rewards; None for equal ones.
+
+    Raises:
+        ConfigurationError: A name or an option that does not exist.
+    """
+    own = 1 if len(conditions) > 1 else num_threads
+    envs = [
+        make_vector_env(condition, size, own, AutoresetMode.DISABLED)
+        for condition, size in zip(conditions, sizes, strict=True)
+    ]
+    return MixedVectorEnv(envs, num_threads, weights)

@@ -129,7 +129,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
 class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     """Many worlds whose actions are residuals of a base policy, (num_envs, k).
 
-    It restarts worlds itself, in the autoreset mode that the environment had, between decisions only.
+    It restarts worlds itself, between decisions only.
 
     Args:
         env: A vector environment of ours.
@@ -138,6 +138,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
             by the end of their names; None for 0.6 or 0.02 rad.
         decision_period: Control steps per decision.
+        autoreset_mode: When; None as the environment would.
         **settings: Further parameters of `ResidualSettings`.
 
     Raises:
@@ -151,13 +152,14 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         space: Space = "model",
         scale: float | dict[str, float] | None = None,
         decision_period: int = 25,
+        autoreset_mode: AutoresetMode | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(env)
         chosen = _settings(space, scale, decision_period, settings)
         self._deciding = _Deciding(env, base_policy, chosen, env.num_envs)
         inner: Any = env.unwrapped
-        self.autoreset_mode = inner.autoreset_mode
+        self.autoreset_mode = autoreset_mode or inner.autoreset_mode
         inner.autoreset_mode = AutoresetMode.DISABLED
         inner.metadata = {**inner.metadata, "autoreset_mode": AutoresetMode.DISABLED}
         self.metadata = {**inner.metadata, "autoreset_mode": self.autoreset_mode}

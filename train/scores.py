@@ -2,14 +2,18 @@
 
 import csv
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from baselines.residual import ResidualDescription, save_residual
+from elastic_env.signals import Array, BoolArray
+from train.conditions import Condition
 from train.environments import environment
-from train.evaluate import evaluate
+from train.evaluate import make_policy
+from train.mixed_env import mixed_env
 from train.progress import PROGRESS
 from train.runs import provenance
 from train.train_config import TrainConfig
@@ -28,7 +32,7 @@ class Scores:
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
         self._config, self._folder, self._threads = config, folder, threads
         self._provenance = provenance(seed)
-        self._base_scores: dict[str, tuple[list[float], int]] = {}
+        self._base_scores: list[tuple[list[float], int]] | None = None
         self.best = np.inf
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
 
@@ -36,12 +40,12 @@ class Scores:
         """Score a policy after some decisions, and keep it where it is the best so far."""
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
+        if self._base_scores is None:
+            self._base_scores = self._played(self._config.base, columns)
         table, ratios = [], []
-        for scenario in self._config.scenarios:
-            if scenario not in self._base_scores:
-                self._base_scores[scenario] = self._score(scenario, self._config.base, columns)
-            mine, falls = self._score(scenario, f"residual:{current}", columns)
-            base, base_falls = self._base_scores[scenario]
+        for scenario, (mine, falls), (base, base_falls) in zip(
+            self._config.scenarios, self._played(f"residual:{current}", columns), self._base_scores, strict=True
+        ):
             table.append([decisions, scenario, *mine, *base, falls, base_falls])
             ratios.append(np.nan_to_num(np.array(mine) / base, nan=10.0).mean() + falls)
         header = ["decisions", "scenario", *columns, *(f"base_{name}" for name in columns), "failed", "base_failed"]
@@ -73,11 +77,14 @@ class Scores:
         fresh.write_text("".join([lines[0], *kept]))
         fresh.replace(path)
 
-    def _score(self, scenario: str, policy: str, metrics: list[str]) -> tuple[list[float], int]:
-        """Means of metrics over the episodes that did not fail, and how many did."""
-        result = evaluate(self._config.condition(scenario, policy), num_threads=self._threads)
-        values = [result.values(metric) for metric in metrics]
-        return [float(np.mean(some)) if len(some) else np.nan for some in values], result.num_failed
+    def _played(self, policy: str, metrics: list[str]) -> list[tuple[list[float], int]]:
+        """For each scenario means of metrics over the episodes that did not fail, and how many did."""
+        conditions = [self._config.condition(scenario, policy) for scenario in self._config.scenarios]
+        results = played_together(conditions, metrics, self._threads)
+        return [
+            ([float(np.mean(some)) if len(some) else np.nan for some in result[~failed].T], int(failed.sum()))
+            for result, failed in results
+        ]
 
 
 def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
@@ -87,3 +94,40 @@ def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
         if is_new:
             writer.writerow(header)
         writer.writerows(rows)
+
+
+def played_together(
+    conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
+) -> list[tuple[Array, BoolArray]]:
+    """Play the episodes of several conditions at once: the scores of `evaluate`, without its time series.
+
+    Args:
+        conditions: Cells of one environment, motion and policy.
+        metrics: Names of scores.
+        num_threads: Threads, 0 for all cores.
+
+    Returns:
+        For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
+    """
+    sizes = [condition.episodes for condition in conditions]
+    worlds = mixed_env(conditions, sizes, num_threads)
+    try:
+        policy = make_policy(conditions[0].policy, worlds)
+        seeds = [condition.seed + episode for condition in conditions for episode in range(condition.episodes)]
+        values, failed = np.full((len(seeds), len(metrics)), np.nan), np.zeros(len(seeds), dtype=np.bool_)
+        observation, _ = worlds.reset(seed=seeds)
+        state, starting, playing = None, np.ones_like(failed), np.ones_like(failed)
+        while playing.any():
+            action, state = policy.predict(observation, state=state, episode_start=starting, deterministic=True)
+            observation, _, terminated, truncated, info = worlds.step(action)
+            starting = terminated | truncated
+            if starting.any():
+                scores = np.stack([info["episode_metrics"][name] for name in metrics], axis=1)
+                first = playing & starting
+                values[first], failed[first] = scores[first], terminated[first]
+                playing &= ~starting
+                observation, _ = worlds.reset(options={"reset_mask": starting})
+    finally:
+        worlds.close()
+    parts = np.cumsum(sizes)[:-1]
+    return list(zip(np.split(values, parts), np.split(failed, parts), strict=True))

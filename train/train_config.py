@@ -12,8 +12,7 @@ from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import environment
-from train.evaluate import make_vector_env
-from train.mixed_env import MixedVectorEnv
+from train.mixed_env import mixed_env
 from train.residual_env import ResidualVectorWrapper
 
 FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
@@ -110,7 +109,7 @@ class TrainConfig(Model):
         return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
 
 
-def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> MixedVectorEnv:
+def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> ResidualVectorWrapper:
     """Worlds under residuals of the configuration's base.
 
     Args:
@@ -121,12 +120,13 @@ def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads:
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    own = 1 if len(shares) > 1 else threads  # scenarios step side by side
-    wrapped = []
-    for scenario, worlds in shares:
-        condition = config.condition(scenario, config.base)
-        apart = {**condition.environment.learned_from, **config.env_options}
-        env = make_vector_env(condition.replace(env_options=apart), worlds, own, AutoresetMode.SAME_STEP)
-        base = baselines.make(config.base, env, **config.base_options)
-        wrapped.append(ResidualVectorWrapper(env, base, **config.settings.model_dump()))
-    return MixedVectorEnv(wrapped, threads, [config.weights.get(scenario, 1.0) for scenario, _ in shares])
+    conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
+    apart = {**environment(config.env).learned_from, **config.env_options}
+    worlds = mixed_env(
+        [condition.replace(env_options=apart) for condition in conditions],
+        [count for _, count in shares],
+        threads,
+        [config.weights.get(scenario, 1.0) for scenario, _ in shares],
+    )
+    base = baselines.make(config.base, worlds, **config.base_options)
+    return ResidualVectorWrapper(worlds, base, autoreset_mode=AutoresetMode.SAME_STEP, **config.settings.model_dump())
