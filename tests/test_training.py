@@ -280,15 +280,26 @@ def test_episodes_played_together_score_as_alone(env: str) -> None:
         np.testing.assert_array_equal(values[~failed, 0], alone.values(metric))
 
 
-def test_spread_worlds_stand_all_over_the_walk() -> None:
-    """Catches worlds that begin together, so that every batch shows one phase."""
+def test_staggered_worlds_stand_all_over_the_walk() -> None:
+    """Catches worlds that begin together for good, so that every batch shows one phase, and a cut that is an end."""
     env = wrapped("walker", 6, base="input_output")
-    features, _ = env.reset(seed=0)
-    spread = env.spread(features, np.random.default_rng(0))
+    env.reset(seed=0)
+    env.stagger(np.random.default_rng(0))
     clock = env.unwrapped.task.observation_table.names.index("clock.time")  # type: ignore[attr-defined]
-    times = np.sort(spread[:, clock])
     length = env.unwrapped.task.num_steps * 0.004  # type: ignore[attr-defined]
-    assert np.diff(times).min() > 0.08 * length
+    ends = np.zeros(6, dtype=np.int64)
+    features = np.zeros(())
+    for decision in range(1, int(length / 0.04) + 1):
+        features, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
+        assert not terminated.any()
+        ends += truncated
+        for world in np.flatnonzero(truncated):
+            assert info["final_obs"][world][clock] == pytest.approx(0.04 * decision, abs=0.005)
+            # the last of them ends by itself
+            assert ("episode_metrics" in info["final_info"]) == (0.04 * decision >= length)
+    assert ends.tolist().count(1) >= 5
+    times = np.sort(features[:, clock])
+    assert np.diff(times).min() > 0.1 * length
     assert times[-1] - times[0] > 0.6 * length
 
 

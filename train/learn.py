@@ -57,8 +57,7 @@ class Training(Trainer):
         torch.set_num_threads(1)  # more would fight the threads of the physics
         torch.use_deterministic_algorithms(True)
         super().__init__(config, seed, folder, threads)
-        self._spread = np.random.default_rng(seed)
-        self._worlds = SB3VecEnv(training_worlds(config, config.shares, threads), self._spread)
+        self._worlds = SB3VecEnv(training_worlds(config, config.shares, threads), np.random.default_rng(seed))
         options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
         gamma = options.get("gamma", 0.99)
         self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)

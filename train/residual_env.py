@@ -172,6 +172,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._rows = np.zeros((env.num_envs, 0))
         self._last: Array | None = None
         self._done = np.zeros(env.num_envs, dtype=np.bool_)
+        self._decisions, self._cut_at = 0, np.zeros(env.num_envs, dtype=np.int64)
 
     @property
     def settings(self) -> ResidualSettings:
@@ -190,32 +191,23 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._last = features if self._last is None else np.where(mask[:, None], features, self._last)
         return self._last.copy(), info
 
-    def spread(self, features: Array, generator: np.random.Generator) -> Array:
-        """Let the base walk until the worlds are spread evenly over an episode, at decisions drawn from a generator.
+    def stagger(self, generator: np.random.Generator) -> None:
+        """Cut the first episodes at decisions spread evenly over their length, in an order drawn from a generator.
 
-        Call it after `reset` with what that returned; learning that begins with all worlds in the same phase of the
-        walk would see one phase at a time.
+        Call it after `reset`. From the end of the first whole episode on the worlds are all over it; learning that saw
+        all worlds in the same phase would see one phase at a time. What is cut counts as truncated, and has no metrics.
         """
         length = -(-self.env.unwrapped.task.num_steps // self.settings.decision_period)  # type: ignore[attr-defined]
-        begin = generator.permutation(np.arange(self.num_envs) * length // self.num_envs)
-        idle = np.zeros(self.action_space.shape or ())
-        for decision in range(length):
-            begins = begin == decision
-            if decision > 0 and begins.any():
-                features = self._restarted(begins, features)
-            outcome = self._decide(idle, np.ones(self.num_envs, dtype=np.bool_))
-            features = outcome.features
-            ended = outcome.terminated | outcome.truncated
-            if ended.any():
-                features = self._restarted(ended, features)
-        self._last = features.copy()
-        return features
+        self._decisions = 0
+        self._cut_at = -(-generator.permutation(np.arange(1, self.num_envs + 1)) * length // self.num_envs)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One decision in every world."""
         residual = self._deciding.checked(actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
         outcome = self._decide(residual, ~waiting)
+        self._decisions += 1
+        outcome.truncated |= (self._cut_at == self._decisions) & ~outcome.terminated & ~waiting
         features, info = outcome.features, outcome.info
         self._done = outcome.terminated | outcome.truncated
         if waiting.any():

@@ -21,22 +21,22 @@ class SB3VecEnv(VecEnv):
 
     Args:
         env: With `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
-        spread: Generator that spreads the worlds over the episode at a reset, see `ResidualVectorWrapper.spread`; None
-            to begin all together.
+        stagger: Generator for an order in which first episodes end early, see `ResidualVectorWrapper.stagger`; None to
+            let all worlds go on in step.
 
     Raises:
         ConfigurationError: Another autoreset mode.
     """
 
     def __init__(
-        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], spread: np.random.Generator | None = None
+        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], stagger: np.random.Generator | None = None
     ) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ConfigurationError(
                 f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
             )
-        self.env, self._spread = env, spread
+        self.env, self._stagger = env, stagger
         self._actions: Any = None
         self._reward, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -45,8 +45,8 @@ class SB3VecEnv(VecEnv):
         """Begin an episode in every world, with the seeds of the last call of `seed`."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         observation, _ = self.env.reset(seed=seeds)
-        if self._spread is not None:
-            observation = self.env.spread(observation, self._spread)  # type: ignore[attr-defined]
+        if self._stagger is not None:
+            self.env.stagger(self._stagger)  # type: ignore[attr-defined]
         self._reset_seeds()
         self._reset_options()
         self._reward[:], self._length[:] = 0.0, 0
@@ -66,13 +66,15 @@ class SB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
         if done.any():
             final = info["final_info"]
-            metrics = final.get("episode_metrics", {})
+            metrics, scored = final.get("episode_metrics", {}), final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],
                     "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
                     "episode": {"r": float(self._reward[world]), "l": int(self._length[world]), "t": 0.0},
-                    "episode_metrics": {name: values[world].item() for name, values in metrics.items()},
+                    "episode_metrics": {
+                        name: values[world].item() for name, values in metrics.items() if scored[world]
+                    },
                 }
             self._reward[done], self._length[done] = 0.0, 0
         return observation, reward.astype(np.float32), done, infos
