@@ -34,7 +34,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "SAC": {
         "gamma": 0.95, "learning_rate": 5e-4, "batch_size": 512, "buffer_size": 200_000, "learning_starts": 2_000,
-        "train_freq": 4, "gradient_steps": 8, "policy_kwargs": {"net_arch": [64, 64]},
+        "train_freq": 4, "gradient_steps": 8, "policy_kwargs": {"net_arch": {"pi": [64, 64], "qf": [256, 256]}},
     },
 }  # fmt: skip
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
