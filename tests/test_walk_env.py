@@ -1116,6 +1116,21 @@ def test_weights_of_the_reward_can_be_chosen() -> None:
     np.testing.assert_array_equal(rewards[1]["tilt"], rewards[0]["tilt"])
 
 
+def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics() -> None:
+    """Catches a factor on the walk itself, on other terms, or at other steps than those that the metrics leave out."""
+    logs = []
+    for standing in (1.0, 0.25):
+        env = walk_worlds(1, scenario="ideal", reward={"standing": standing})
+        env.reset(seed=0)
+        logs.append([env.step(np.zeros((1, 12)))[4]["reward_terms"] for _ in range(env.task.num_steps)])
+    whole, less = ({name: np.array([terms[name][0] for terms in log]) for name in log[0]} for log in logs)
+    walking = env.task.plan.timing.walking[np.arange(1, env.task.num_steps + 1).clip(max=env.task.num_steps)]
+    for name, values in less.items():
+        factor = np.where(walking, 1.0, 0.25) if name in ("tilt", "zmp") else 1.0
+        np.testing.assert_allclose(values, factor * whole[name], rtol=1e-12, err_msg=name)
+    assert 0 < walking.sum() < len(walking)
+
+
 def test_penalties_never_saturate() -> None:
     """Catches a kernel that hides how bad a large error is: twice the error costs twice as much."""
     errors = np.array([1e-3, 0.01, 0.2, 1.0])

@@ -30,6 +30,9 @@ class WalkRewardWeights(Model):
     effort: float = quantity("1/(N·m)", 0.001, ge=0, description="per N·m of servo torque, rms over the joints")
     smoothness: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offsets, rms over joints")
     fall: float = quantity("1", 200.0, ge=0, description="once, at a fall or where the simulation diverges")
+    standing: float = quantity(
+        "1", 1.0, ge=0, description="factor of tilt and zmp before and after the walk, where the metrics count nothing"
+    )
 
 
 class WalkConfig(Model):

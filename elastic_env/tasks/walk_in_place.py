@@ -287,9 +287,10 @@ class WalkTask:
         """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
         weights, state = self.config.reward, sample.state
         deviation = state.zmp - self.plan.zmp.take(self._now, axis=0)
+        counts = np.where(self._phases[0].take(self._now), 1.0, weights.standing)
         return {
-            "tilt": weights.tilt * tilt_penalty(state.attitude[:, 2]),
-            "zmp": weights.zmp * zmp_penalty(np.hypot(deviation[:, 0], deviation[:, 1])),
+            "tilt": weights.tilt * counts * tilt_penalty(state.attitude[:, 2]),
+            "zmp": weights.zmp * counts * zmp_penalty(np.hypot(deviation[:, 0], deviation[:, 1])),
             "effort": -weights.effort * rms(state.servo_torque),
             "smoothness": -weights.smoothness * self._command_rate(sample),
             "fall": -weights.fall * (diverged | self._fallen),
