@@ -250,13 +250,17 @@ def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
     one = some_worlds(n=1)
     with pytest.raises(ConfigurationError, match=r"at least one environment"):
         MixedVectorEnv([])
-    with pytest.raises(ConfigurationError, match=r"must have autoreset_mode Disabled"):
+    with pytest.raises(ConfigurationError, match=r"autoreset_mode Disabled, got NextStep"):
         MixedVectorEnv([one, some_worlds(n=1, autoreset_mode=AutoresetMode.NEXT_STEP)])
-    for other in (some_worlds("walker", 1), some_worlds(n=1, reference={**SINE, "duration_s": 2.0})):
-        with pytest.raises(ConfigurationError, match=r"the same task and motion"):
+    for other, problem in (
+        (some_worlds("walker", 1), "observation"),
+        (some_worlds(n=1, observe_link=True), "observation"),
+        (some_worlds(n=1, reference={**SINE, "duration_s": 2.0}), "task and motion"),
+    ):
+        with pytest.raises(ConfigurationError, match=f"must have the same {problem}"):
             MixedVectorEnv([one, other])
     for pair in ([one, some_worlds(n=1, stiffness=900.0)], [some_worlds("walker", 1, x) for x in ("ideal", "soft")]):
-        with pytest.raises(ConfigurationError, match=r"assume the same joints; .* keep them apart"):
+        with pytest.raises(ConfigurationError, match=r"assume the same joints: .* apart from the others"):
             MixedVectorEnv(pair)
     with pytest.raises(ConfigurationError, match=r"oracle .* one environment"):
         baselines.make("oracle", MixedVectorEnv([one]))

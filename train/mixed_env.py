@@ -32,7 +32,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         weights: Factor of each environment's rewards; None for equal ones.
 
     Raises:
-        ConfigurationError: None, different tasks, another autoreset mode, or not one weight per environment.
+        ConfigurationError: None, different observations, tasks, motions or assumed joints, another autoreset mode, or
+            not one weight per environment.
     """
 
     def __init__(
@@ -46,13 +47,16 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.envs: list[Any] = [env.unwrapped for env in envs]
         for env in self.envs:
             if env.autoreset_mode is not AutoresetMode.DISABLED:
-                raise ConfigurationError("all environments of a mixture must have autoreset_mode Disabled")
+                mode = env.autoreset_mode.value
+                raise ConfigurationError(f"all environments of a mixture must have autoreset_mode Disabled, got {mode}")
+            if env.single_observation_space != self.envs[0].single_observation_space:
+                raise ConfigurationError("all environments of a mixture must have the same observation")
             if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
                 raise ConfigurationError("all environments of a mixture must have the same task and motion")
             if env.assumed_model.joints != self.assumed_model.joints:
                 raise ConfigurationError(
-                    "all environments of a mixture must let a policy assume the same joints; the scenarios with "
-                    '"ideal" assume no friction, the others do: keep them apart'
+                    "all environments of a mixture must let a policy assume the same joints: give them the same "
+                    'stiffness, and keep scenarios with "ideal", where no friction is assumed, apart from the others'
                 )
         factors = [1.0] * len(envs) if weights is None else list(weights)
         if len(factors) != len(envs):
