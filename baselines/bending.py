@@ -45,7 +45,6 @@ class BendingObserver:
         "excess_load",
     )
     """What `observe` returns: ρ and its standard deviation, and measured over assumed load less one [1]."""
-    width = len(names)
     memory_width = _ESTIMATE + _VARIANCES
 
     def __init__(self, model: WalkerModel) -> None:

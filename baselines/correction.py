@@ -40,6 +40,9 @@ class ResidualSettings(Model):
     shared: bool = False
     """Whether left and right joints of the same name share their residual: there are half as many to explore, and one
     that follows the step still tells the legs apart by which of them carries the robot."""
+    mirror: bool = False
+    """Whether it sees a step on the right foot in the mirror, as a step on the left (`baselines.mirror`). For a walker
+    with `shared` corrections of the model, which are the same in the mirror."""
     observe: tuple[str, ...] = Field(default=("observation",), min_length=1)
     """What it sees: groups of the observation such as (clock, load_share), or all of it, and what
     `baselines.features` makes of it and of the plan."""
@@ -50,6 +53,15 @@ class ResidualSettings(Model):
         scales = self.scale.values() if isinstance(self.scale, dict) else [1.0 if self.scale is None else self.scale]
         if not all(0.0 < scale < np.inf for scale in scales):
             raise ValueError(f"scale must be positive, got {self.scale}")
+        return self
+
+    @model_validator(mode="after")
+    def _mirrored_corrections_are_alike(self) -> Self:
+        if self.mirror and not (self.shared and self.space == "model"):
+            raise ValueError(
+                f"mirror needs corrections that are the same in the mirror: shared: true in space 'model', "
+                f"got shared: {str(self.shared).lower()} in space {self.space!r}"
+            )
         return self
 
     def corrected_joints(self, names: list[str]) -> IntArray:

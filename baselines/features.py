@@ -11,7 +11,7 @@
 | `base_action` | what the base alone would command now [rad] |
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from baselines.bending import BendingObserver
 from baselines.correction import Corrected
 from baselines.ground_level import GroundLevel
+from baselines.mirror import Mirror
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.robots.thormang import SIDES
@@ -32,7 +33,7 @@ _MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "w
 class Source(Protocol):
     """Some features from observations, with a memory per world."""
 
-    width: int
+    names: tuple[str, ...]
     memory_width: int
 
     def begin(self, num_worlds: int) -> Array:
@@ -40,7 +41,7 @@ class Source(Protocol):
         ...
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Features of observations, (num_worlds, m) to (num_worlds, width), and the new memory."""
+        """Features of observations, (num_worlds, m) to (num_worlds, names), and the new memory."""
         ...
 
 
@@ -62,13 +63,17 @@ class Features:
         period_s = settings.decision_period * model.control_period_s
         self._sources = [_source(name, model, period_s) for name in names]
         self._acts = BASE_ACTION in settings.observe
-        widths = [source.width for source in self._sources]
+        widths = [len(source.names) for source in self._sources]
         is_measured = np.repeat([name.split(".")[0] in _MEASUREMENTS for name in names], widths)
         self._measured, self._history = np.flatnonzero(is_measured), settings.history
         past = self._history * len(self._measured)
         self._ends = np.cumsum([past, *(source.memory_width for source in self._sources)])
-        self.width = sum(widths) + self._acts * len(model.joint_names) + past
+        seen = [name for source in self._sources for name in source.names]
+        commanded = [f"{BASE_ACTION}.{joint}" for joint in model.joint_names] if self._acts else []
+        self.names = (*seen, *commanded)
+        self.width = len(self.names) + past
         self.memory_width = int(self._ends[-1])
+        self._mirror = _LeftFirst(self.names, [seen[i] for i in self._measured], model) if settings.mirror else None
 
     def at(
         self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
@@ -97,7 +102,36 @@ class Features:
         if self._acts:
             parts.append(np.asarray(self._corrected.base_action(rows, state, episode_start), dtype=np.float64))
         remembered = np.hstack([measured, past])[:, : past.shape[1]]
-        return np.hstack([*parts, past]), np.hstack([remembered, *(kept for _, kept in observed)])
+        features = np.hstack([*parts, past])
+        if self._mirror is not None:
+            features = self._mirror(rows, features)
+        return features, np.hstack([remembered, *(kept for _, kept in observed)])
+
+
+class _LeftFirst:
+    """Shows steps on the right foot in the mirror, as steps on the left.
+
+    Args:
+        names: Of the features, earlier measurements left out.
+        measured: Of the earlier measurements of one decision.
+        model: Assumed robot.
+
+    Raises:
+        ConfigurationError: No walker, or a name without a mirror image.
+    """
+
+    def __init__(self, names: Sequence[str], measured: Sequence[str], model: RobotModel) -> None:
+        if not isinstance(model, WalkerModel):
+            raise ConfigurationError("mirror is for residuals on a walker, whose legs are mirror images")
+        self._now, self._past = Mirror(names, model.biped), Mirror(measured, model.biped)
+        self._split, self._measured = len(names), len(measured)
+        self._support = model.observation_table.columns("clock.support")
+
+    def __call__(self, rows: Array, features: Array) -> Array:
+        """Features as they are while the left foot is that of the step, and mirrored while the right is."""
+        now, past = np.split(features, [self._split], axis=1)
+        past = self._past(past.reshape(len(past), -1, max(self._measured, 1))).reshape(past.shape)
+        return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
 
 
 def _groups(model: RobotModel) -> list[str]:
@@ -117,7 +151,7 @@ def _named(observe: tuple[str, ...], model: RobotModel) -> list[str]:
 def _source(name: str, model: RobotModel, period_s: float) -> Source:
     if name in _groups(model) or name in model.observation_table.names:
         group = model.observation_table.group(name)
-        return _Instant(lambda rows: rows[:, group], len(model.observation_table))
+        return _Instant(model.observation_table.names[group], lambda rows: rows[:, group])
     if name == "encoder_error":
         return _encoder_error(model)
     if isinstance(model, WalkerModel) and name == "contact_error":
@@ -135,9 +169,8 @@ class _Instant:
 
     memory_width = 0
 
-    def __init__(self, function: Callable[[Array], Array], columns: int) -> None:
-        self._function = function
-        self.width = function(np.zeros((1, columns))).shape[1]
+    def __init__(self, names: tuple[str, ...], function: Callable[[Array], Array]) -> None:
+        self.names, self._function = names, function
 
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 0))
@@ -148,7 +181,8 @@ class _Instant:
 
 def _encoder_error(model: RobotModel) -> _Instant:
     encoder, reference = (model.observation_table.group(name) for name in ("encoder_angle", "reference_angle"))
-    return _Instant(lambda rows: rows[:, encoder] - rows[:, reference], len(model.observation_table))
+    names = tuple(f"encoder_error.{joint}" for joint in model.joint_names)
+    return _Instant(names, lambda rows: rows[:, encoder] - rows[:, reference])
 
 
 class _ContactError:
@@ -158,7 +192,7 @@ class _ContactError:
     for a ZMP.
     """
 
-    width = 3
+    names = ("contact_error.x", "contact_error.y", "contact_error.share")
     _LEAST_N = 50.0
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:

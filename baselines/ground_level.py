@@ -56,7 +56,6 @@ class GroundLevel:
         *(f"level_wrench.{side}_{part}{axis}" for side in "lr" for part in "fm" for axis in "xyz"),
     )
     """What `observe` returns: [rad], [N] and [N·m], the wrenches in the order of the observation."""
-    width = len(names)
     memory_width = 1 + 2 + 2
 
     def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:

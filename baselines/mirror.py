@@ -1,0 +1,97 @@
+"""A walker seen in the mirror of its plane of symmetry, x and z: what the right leg does looks as if the left did it.
+
+A robot that is its own mirror image needs one answer for both of its steps. A residual that always sees the step on
+the left foot has half as much to learn, and learns it from twice as many steps. In the mirror left and right change
+places; vectors change their y, axes of rotation their x and z, and a share of the load or the choice of a foot, p,
+becomes 1 − p [Abdolhosseini2019].
+
+[Abdolhosseini2019] F. Abdolhosseini et al., "On Learning Symmetric Locomotion", Motion, Interaction and Games.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from elastic_env.errors import ConfigurationError
+from elastic_env.signals import Array
+from elastic_env.walking.biped import Biped
+
+_SHARES = {"clock.support", "load_share"}
+"""0 on the left, 1 on the right."""
+_ODD = {
+    "imu_attitude.roll",
+    "own_tilt.roll",
+    "imu_rate.x",
+    "imu_rate.z",
+    "zmp_reference.y",
+    "contact_error.y",
+    "contact_error.share",
+    *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fy", "mx", "mz")),
+}
+"""What changes its sign, but for the sides in the names."""
+_EVEN = {
+    "imu_attitude.pitch",
+    "own_tilt.pitch",
+    "imu_rate.y",
+    "zmp_reference.x",
+    "contact_error.x",
+    "clock.time",
+    "clock.swing",
+    "excess_load",
+    *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fx", "fz", "my")),
+    *(f"{group}.{axis}" for group in ("model_error", "uncertainty") for axis in ("roll", "pitch")),
+}
+"""What keeps it."""
+_LATERAL_AXES = (0, 2)
+
+
+class Mirror:
+    """What signals of a walker are in its mirror.
+
+    Args:
+        names: What the columns hold, as in the tables of observations and features; joints after a dot.
+        biped: The robot.
+
+    Raises:
+        ConfigurationError: A name of which it is not known what it is in the mirror, or one of a side alone.
+    """
+
+    def __init__(self, names: Sequence[str], biped: Biped) -> None:
+        lateral = {
+            name
+            for leg in np.split(np.array(biped.joint_names), 2)
+            for name, axis in zip(leg.tolist(), biped.chains.axis, strict=True)
+            if axis in _LATERAL_AXES
+        }
+        joints = set(biped.joint_names)
+        columns = {name: column for column, name in enumerate(names)}
+        lonely = [name for name in names if _other_side(name) not in columns]
+        if lonely:
+            raise ConfigurationError(f"in the mirror left and right change places, the other side lacks: {lonely}")
+        self._source = np.array([columns[_other_side(name)] for name in names], dtype=np.int64)
+        self._sign = np.array([_sign(name, joints, lateral) for name in names])
+        self._offset = np.array([float(name in _SHARES) for name in names])
+
+    def __call__(self, values: Array) -> Array:
+        """Values in the mirror, (..., columns)."""
+        return self._offset + self._sign * values[..., self._source]
+
+
+def _other_side(name: str) -> str:
+    """The name of the same on the other leg; itself where it has no side."""
+    group, _, part = name.rpartition(".")
+    if part.startswith(("l_", "r_")):
+        part = ("r_" if part[0] == "l" else "l_") + part[2:]
+    return f"{group}.{part}" if group else part
+
+
+def _sign(name: str, joints: set[str], lateral: set[str]) -> float:
+    group, _, part = name.rpartition(".")
+    if part in joints:
+        return -1.0 if part in lateral else 1.0
+    plain = name if not part.startswith(("l_", "r_")) else f"{group}.{part[2:]}"
+    if plain in _EVEN:
+        return 1.0
+    if plain in _ODD or plain in _SHARES:
+        return -1.0
+    raise ConfigurationError(f"it is not known what {name!r} is in the mirror; leave it out, or mirror: false")
