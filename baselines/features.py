@@ -33,8 +33,12 @@ _MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "w
 class Source(Protocol):
     """Some features from observations, with a memory per world."""
 
-    names: tuple[str, ...]
     memory_width: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What its features are, as in the table of the observation."""
+        ...
 
     def begin(self, num_worlds: int) -> Array:
         """Memory before the first measurement, (num_worlds, memory_width)."""

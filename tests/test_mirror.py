@@ -19,7 +19,7 @@ MODEL_SPACE: dict[str, Any] = {"shared": True, "decision_period": 1}
 
 def walker(**options: Any) -> gymnasium.Env[Any, Any]:
     """A fast walk of four steps."""
-    options = {"scenario": "ideal", "step_period": 1.6, "num_steps": 4, **options}
+    options = {"scenario": "ideal", "step_period": [0.3, 0.4, 0.3], "num_steps": 4, **options}
     return gymnasium.make("elastic_env/WalkInPlace-v0", **options)
 
 
@@ -54,10 +54,17 @@ def model_of(env: Any) -> WalkerModel:
     return env.unwrapped.assumed_model
 
 
-def test_a_step_on_the_right_foot_is_one_on_the_left_in_the_mirror() -> None:
-    """Catches a wrong sign or side of any signal: every one of them comes closer with its sign than with the other."""
+@pytest.fixture(scope="module")
+def walk() -> tuple[gymnasium.Env[Any, Any], Array]:
+    """A walk in `ideal` and its observations."""
     env = walker()
-    table, rows = model_of(env).observation_table, walked(env)
+    return env, walked(env)
+
+
+def test_a_step_on_the_right_foot_is_one_on_the_left_in_the_mirror(walk: tuple[Any, Array]) -> None:
+    """Catches a wrong sign or side of any signal: every one of them comes closer with its sign than with the other."""
+    env, rows = walk
+    table = model_of(env).observation_table
     support = rows[:, table.columns("clock.support")][:, 0]
     first, second, third = np.flatnonzero(np.diff(support))[:3] + 1
     assert second - first == third - second  # equally long
@@ -77,7 +84,7 @@ def test_a_step_on_the_right_foot_is_one_on_the_left_in_the_mirror() -> None:
 def test_what_a_residual_sees_of_a_mirrored_walk_is_the_mirror_image() -> None:
     """Catches a feature whose sign or side in the mirror is wrong, on a robot whose joints differ from each other."""
     env = walker(scenario="spread", num_steps=1)
-    model, rows = model_of(env), walked(env)[::10]
+    model, rows = model_of(env), walked(env)[::20]
     observe = ("observation", "encoder_error", "contact_error", "level", "bending", "base_action")
     features, seen = features_of(env, rows, observe=observe)
     _, reflected = features_of(env, Mirror(model.observation_table.names, model.biped)(rows), observe=observe)
@@ -89,10 +96,10 @@ def test_what_a_residual_sees_of_a_mirrored_walk_is_the_mirror_image() -> None:
     ]
 
 
-def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step() -> None:
+def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step(walk: tuple[Any, Array]) -> None:
     """Catches a mirror at the other steps, or of the present but not of the earlier measurements."""
-    env = walker(num_steps=2)
-    model, rows = model_of(env), walked(env)[::20]
+    env = walk[0]
+    model, rows = model_of(env), walk[1][::50]
     settings: dict[str, Any] = {"observe": ("load_share", "encoder_angle", "wrench", "bending"), "history": 2}
     features, plain = features_of(env, rows, **settings)
     _, seen = features_of(env, rows, **settings, mirror=True)
