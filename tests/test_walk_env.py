@@ -1131,6 +1131,22 @@ def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics() ->
     assert 0 < walking.sum() < len(walking)
 
 
+def test_drift_of_the_feet_is_paid_when_it_happens() -> None:
+    """Catches a foot that carries nothing but counts, a foothold of the other foot, and a drift of the episode before."""
+    env = walk_worlds(2, scenario="nominal", reward={"drift": 1000.0})
+    plan = env.task.plan
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        drift, terms = [], []
+        for step in range(env.task.num_steps):
+            row = plan.share[step]
+            beside = env.truth().ankles[..., :2] - plan.ankles[step, :, :2]
+            drift.append(np.hypot(*((1.0 - row) * beside[:, 0] + row * beside[:, 1]).T))
+            terms.append(env.step(np.zeros((2, 12)))[4]["reward_terms"]["drift"])
+        np.testing.assert_allclose(terms[:-1], -1000.0 * np.diff(drift, axis=0), rtol=0.0, atol=1e-9)
+        assert np.ptp(drift, axis=0).min() > 1e-3
+
+
 def test_penalties_never_saturate() -> None:
     """Catches a kernel that hides how bad a large error is: twice the error costs twice as much."""
     errors = np.array([1e-3, 0.01, 0.2, 1.0])
