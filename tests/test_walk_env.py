@@ -1093,6 +1093,7 @@ def test_reward_is_the_sum_of_its_terms_and_the_terms_are_the_documented_ones(sc
             "zmp": -info["zmp_deviation"] / 0.03,
             "effort": -0.001 * info["servo_torque"],
             "smoothness": -0.1 * info["command_rate"],
+            "drift": np.zeros(3),
             "fall": np.zeros(3),
         }
         terms = info["reward_terms"]
@@ -1132,7 +1133,7 @@ def test_standing_can_be_left_out_of_the_reward_as_it_is_out_of_the_metrics() ->
 
 
 def test_drift_of_the_feet_is_paid_when_it_happens() -> None:
-    """Catches a foot that carries nothing but counts, a foothold of the other foot, and a drift of the episode before."""
+    """Catches a foot that counts but carries nothing, the other foot's foothold, and a drift of the episode before."""
     env = walk_worlds(2, scenario="nominal", reward={"drift": 1000.0})
     plan = env.task.plan
     for seed in (0, 1):

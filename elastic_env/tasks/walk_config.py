@@ -33,8 +33,8 @@ class WalkRewardWeights(Model):
         ge=0,
         description="per m by which the loaded feet get further from their footholds; back again counts",
     )
-    """What a foot that lands beside its foothold costs the ZMP comes later, in all that is left of the walk. Paid when it
-    happens, it is learned from by a short discount too."""
+    """A foot that lands beside its foothold costs ZMP in all that is left of the walk; paid when it happens, that
+    counts under a short discount too."""
     effort: float = quantity("1/(N·m)", 0.001, ge=0, description="per N·m of servo torque, rms over the joints")
     smoothness: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offsets, rms over joints")
     fall: float = quantity("1", 200.0, ge=0, description="once, at a fall or where the simulation diverges")
