@@ -25,6 +25,7 @@ _ODD = {
     "imu_rate.z",
     "zmp_reference.y",
     "contact_error.y",
+    "foot_displacement.y",
     "contact_error.share",
     *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fy", "mx", "mz")),
 }
@@ -35,6 +36,7 @@ _EVEN = {
     "imu_rate.y",
     "zmp_reference.x",
     "contact_error.x",
+    "foot_displacement.x",
     "clock.time",
     "clock.swing",
     "excess_load",
@@ -65,9 +67,12 @@ class Mirror:
         }
         joints = set(biped.joint_names)
         columns = {name: column for column, name in enumerate(names)}
-        lonely = [name for name in names if _other_side(name) not in columns]
-        if lonely:
-            raise ConfigurationError(f"in the mirror left and right change places, the other side lacks: {lonely}")
+        lacking = [_other_side(name) for name in names if _other_side(name) not in columns]
+        if lacking:
+            raise ConfigurationError(
+                f"in the mirror left and right change places, but there is no {', '.join(lacking)}; observe both, or "
+                "mirror: false"
+            )
         self._source = np.array([columns[_other_side(name)] for name in names], dtype=np.int64)
         self._sign = np.array([_sign(name, joints, lateral) for name in names])
         self._offset = np.array([float(name in _SHARES) for name in names])

@@ -85,7 +85,7 @@ def test_what_a_residual_sees_of_a_mirrored_walk_is_the_mirror_image() -> None:
     """Catches a feature whose sign or side in the mirror is wrong, on a robot whose joints differ from each other."""
     env = walker(scenario="spread", num_steps=1)
     model, rows = model_of(env), walked(env)[::20]
-    observe = ("observation", "encoder_error", "contact_error", "level", "bending", "base_action")
+    observe = ("observation", "encoder_error", "contact_error", "level", "bending", "odometry", "base_action")
     features, seen = features_of(env, rows, observe=observe)
     _, reflected = features_of(env, Mirror(model.observation_table.names, model.biped)(rows), observe=observe)
     expected = Mirror(features.names, model.biped)(seen)
@@ -100,12 +100,13 @@ def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step
     """Catches a mirror at the other steps, or of the present but not of the earlier measurements."""
     env = walk[0]
     model, rows = model_of(env), walk[1][::50]
-    settings: dict[str, Any] = {"observe": ("load_share", "encoder_angle", "wrench", "bending"), "history": 2}
+    settings: dict[str, Any] = {"observe": ("clock", "encoder_angle", "wrench", "bending"), "history": 2}
     features, plain = features_of(env, rows, **settings)
     _, seen = features_of(env, rows, **settings, mirror=True)
     right = rows[:, model.observation_table.columns("clock.support")][:, 0] == 1.0
     assert 5 < right.sum() < len(rows) - 5
     np.testing.assert_array_equal(seen[~right], plain[~right])
+    np.testing.assert_array_equal(seen[:, features.names.index("clock.support")], 0.0)
     width = len(features.names)
     np.testing.assert_array_equal(seen[right, :width], Mirror(features.names, model.biped)(plain[right, :width]))
     measured = [name for name in features.names if name.startswith(("encoder_angle.", "wrench."))]
@@ -119,14 +120,15 @@ def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step
     [
         ({"shared": False}, "shared: false"),
         ({"space": "joint"}, "'joint'"),
-        ({"observe": ("wrench.l_fx",)}, "wrench.l_fx"),
+        ({"observe": ("wrench.l_fx",)}, "no wrench.r_fx; observe both"),
+        ({"joints": ("l_knee",)}, "not for l_knee; name joints without"),
+        ({"joints": ("knee",), "scale": {"l_knee": 0.2, "r_knee": 0.6}}, "not for l_knee"),
     ],
 )
 def test_what_has_no_mirror_image_is_refused(settings: dict[str, Any], message: str) -> None:
     """Catches corrections that would go to the wrong leg, and half of a pair."""
-    env = walker()
     with pytest.raises(ConfigurationError, match=message):
-        features_of(env, np.zeros((0, 1)), **settings, mirror=True)
+        features_of(walker(), np.zeros((0, 1)), **settings, mirror=True)
 
 
 def test_the_testbed_has_no_mirror_image() -> None:
