@@ -85,21 +85,6 @@ class BendingObserver:
         theta = rows[:, self._theta]
         return theta - self._compensator.at(rows).link_angle(theta, theta)
 
-    def link_angles(self, rows: Array, estimates: Array) -> Array:
-        """Link angles by the expected bending and its estimated error in roll, (num_worlds, 12) [rad].
-
-        That in pitch is left out: friction hides more than it shows.
-
-        Args:
-            rows: Observations, (num_worlds, m).
-            estimates: As `observe` returned them, (num_worlds, names).
-        """
-        legs = rows[:, self._theta].reshape(len(rows), 2, -1)
-        bending = self.bending(rows).reshape(legs.shape)
-        about_x = np.array(self._model.biped.chains.axis) == 0
-        model_error = estimates[:, [self.names.index(f"model_error.{side}_roll") for side in "lr"], None]
-        return (legs - (1.0 + about_x * model_error) * bending).reshape(len(rows), -1)
-
     def expected_tilt(self, rows: Array) -> Array:
         """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds, 2 legs, 2) [rad]."""
         return self.disagreement(rows, self.bending(rows))[1]

@@ -8,11 +8,10 @@
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.bending`) |
-| `odometry` | walker: how far the feet are from their footholds (`baselines.odometry`) |
 | `base_action` | what the base alone would command now [rad] |
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,8 +19,7 @@ import numpy as np
 from baselines.bending import BendingObserver
 from baselines.correction import Corrected
 from baselines.ground_level import GroundLevel
-from baselines.mirror import Mirror
-from baselines.odometry import LegOdometry
+from baselines.mirror import LeftFirst
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.robots.thormang import SIDES
@@ -80,7 +78,7 @@ class Features:
         self.width = len(self.names) + past
         self.memory_width = int(self._ends[-1])
         measured = [seen[i] for i in self._measured]
-        self._mirror = _LeftFirst(self.names, measured, corrected) if settings.mirror else None
+        self._mirror = LeftFirst(self.names, measured, corrected) if settings.mirror else None
 
     def at(
         self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
@@ -115,43 +113,6 @@ class Features:
         return features, np.hstack([remembered, *(kept for _, kept in observed)])
 
 
-class _LeftFirst:
-    """Shows steps on the right foot in the mirror, as steps on the left.
-
-    Args:
-        names: Of the features, earlier measurements left out.
-        measured: Of the measurements of one earlier decision.
-        corrected: The base and its correction, which is the same in the mirror.
-
-    Raises:
-        ConfigurationError: No walker, a name without a mirror image, or a joint corrected unlike the other leg's.
-    """
-
-    def __init__(self, names: Sequence[str], measured: Sequence[str], corrected: Corrected) -> None:
-        model, settings = corrected.model, corrected.settings
-        if not isinstance(model, WalkerModel):
-            raise ConfigurationError("mirror is for residuals on a walker, whose legs are mirror images")
-        scale = np.zeros(len(model.joint_names))
-        scale[corrected.joints] = settings.scales(model.joint_names)
-        unlike = [
-            name for name, *pair in zip(model.joint_names, *np.split(scale, 2), strict=False) if np.ptp(pair) > 0.0
-        ]
-        if unlike:
-            raise ConfigurationError(
-                f"mirror needs joints and scale that are the same on both legs, they are not for {', '.join(unlike)}; "
-                "name joints without l_ and r_, or mirror: false"
-            )
-        self._now, self._past = Mirror(names, model.biped), Mirror(measured, model.biped)
-        self._split, self._earlier = len(names), (settings.history, len(measured))
-        self._support = model.observation_table.columns("clock.support")
-
-    def __call__(self, rows: Array, features: Array) -> Array:
-        """Features as they are while the left foot is that of the step, and mirrored while the right is."""
-        now, past = np.split(features, [self._split], axis=1)
-        past = self._past(past.reshape(len(past), *self._earlier)).reshape(past.shape)
-        return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
-
-
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""
     return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
@@ -178,10 +139,7 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
         return GroundLevel(model, period_s)
     if isinstance(model, WalkerModel) and name == "bending":
         return BendingObserver(model)
-    if isinstance(model, WalkerModel) and name == "odometry":
-        return LegOdometry(model, period_s)
-    of_walker = ["contact_error", "level", "bending", "odometry"] if isinstance(model, WalkerModel) else []
-    further = ["encoder_error", *of_walker]
+    further = ["encoder_error", *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
     raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
 
 

@@ -8,11 +8,14 @@ becomes 1 − p [Abdolhosseini2019].
 [Abdolhosseini2019] F. Abdolhosseini et al., "On Learning Symmetric Locomotion", Motion, Interaction and Games.
 """
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
 
+from baselines.correction import Corrected
 from elastic_env.errors import ConfigurationError
+from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
 
@@ -25,7 +28,6 @@ _ODD = {
     "imu_rate.z",
     "zmp_reference.y",
     "contact_error.y",
-    "foot_displacement.y",
     "contact_error.share",
     *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fy", "mx", "mz")),
 }
@@ -36,7 +38,6 @@ _EVEN = {
     "imu_rate.y",
     "zmp_reference.x",
     "contact_error.x",
-    "foot_displacement.x",
     "clock.time",
     "clock.swing",
     "excess_load",
@@ -45,6 +46,7 @@ _EVEN = {
 }
 """What keeps it."""
 _LATERAL_AXES = (0, 2)
+_SIDE = re.compile(r"(?<=\.)[lr]_")
 
 
 class Mirror:
@@ -82,19 +84,62 @@ class Mirror:
         return self._offset + self._sign * values[..., self._source]
 
 
+class LeftFirst:
+    """Shows steps on the right foot in the mirror, as steps on the left.
+
+    Args:
+        names: Of the features, earlier measurements left out.
+        measured: Of the measurements of one earlier decision.
+        corrected: The base and its correction, which is the same in the mirror.
+
+    Raises:
+        ConfigurationError: No walker, a name without a mirror image, or a joint corrected unlike the other leg's.
+    """
+
+    def __init__(self, names: Sequence[str], measured: Sequence[str], corrected: Corrected) -> None:
+        model, settings = corrected.model, corrected.settings
+        if not isinstance(model, WalkerModel):
+            raise ConfigurationError(
+                f"mirror is for a walker, whose legs are mirror images, got a {type(model).__name__}; set mirror: false"
+            )
+        scale = np.zeros(len(model.joint_names))
+        scale[corrected.joints] = settings.scales(model.joint_names)
+        unlike = [
+            name for name, *pair in zip(model.joint_names, *np.split(scale, 2), strict=False) if np.ptp(pair) > 0.0
+        ]
+        if unlike:
+            raise ConfigurationError(
+                f"mirror needs joints and scale that are the same on both legs, they are not for {', '.join(unlike)}; "
+                "name joints without l_ and r_, or mirror: false"
+            )
+        self._now, self._past = Mirror(names, model.biped), Mirror(measured, model.biped)
+        self._split, self._earlier = len(names), (settings.history, len(measured))
+        self._support = model.observation_table.columns("clock.support")
+
+    def __call__(self, rows: Array, features: Array) -> Array:
+        """Features as they are while the left foot is that of the step, and mirrored while the right is.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            features: Of the same measurements, earlier ones last, (num_worlds, width).
+
+        Returns:
+            (num_worlds, width).
+        """
+        now, past = np.split(features, [self._split], axis=1)
+        past = self._past(past.reshape(len(past), *self._earlier)).reshape(past.shape)
+        return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
+
+
 def _other_side(name: str) -> str:
     """The name of the same on the other leg; itself where it has no side."""
-    group, _, part = name.rpartition(".")
-    if part.startswith(("l_", "r_")):
-        part = ("r_" if part[0] == "l" else "l_") + part[2:]
-    return f"{group}.{part}" if group else part
+    return _SIDE.sub(lambda side: "r_" if side[0] == "l_" else "l_", name)
 
 
 def _sign(name: str, joints: set[str], lateral: set[str]) -> float:
-    group, _, part = name.rpartition(".")
-    if part in joints:
-        return -1.0 if part in lateral else 1.0
-    plain = name if not part.startswith(("l_", "r_")) else f"{group}.{part[2:]}"
+    joint, plain = name.rpartition(".")[2], _SIDE.sub("", name)
+    if joint in joints:
+        return -1.0 if joint in lateral else 1.0
     if plain in _EVEN:
         return 1.0
     if plain in _ODD or plain in _SHARES:

@@ -190,7 +190,7 @@ class WalkTask:
         self._contact_since[worlds] = -1
         simulation.refresh(worlds)
         self._read(simulation, worlds)
-        self._drift = np.where(worlds, self._feet_drift(), self._drift)
+        self._drift = self._feet_drift()
         fresh = self._measure(worlds)
         at_rest = WalkMeasurement(fresh.encoder, fresh.encoder, fresh.body)
         self._measured = self._measured.with_worlds(worlds, at_rest)
