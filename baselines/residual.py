@@ -165,7 +165,8 @@ class ResidualPolicy:
             memory = memory.copy()
             fresh = memory[:, 0] == _UNDECIDED
             features, past = self._features.at(rows, memory[:, 1 + k :], fresh, inner, episode_start)
-            memory[due, 1 : 1 + k], memory[due, 1 + k :] = self._network(features[due]), past[due]
+            decided = self._network(features[due]) * self._features.permitted(features[due])
+            memory[due, 1 : 1 + k], memory[due, 1 + k :] = decided, past[due]
             memory[due, 0] = 0.0
         action, inner = self.corrected.act(observation, memory[:, 1 : 1 + k], inner, episode_start)
         counted = memory.copy()
