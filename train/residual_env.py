@@ -34,7 +34,6 @@ class _Deciding:
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
         self._state: Any = None
         self._past: Array | None = None
-        self._permitted = np.ones((num_worlds, 1))
 
     def begin(self, worlds: BoolArray) -> None:
         """Episodes begin in some worlds, a (num_worlds,) mask."""
@@ -47,13 +46,11 @@ class _Deciding:
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
         self._past = past if worlds is None or self._past is None else np.where(worlds[:, None], past, self._past)
         self._fresh = np.zeros_like(self._fresh) if worlds is None else self._fresh & ~worlds
-        permitted = self.features.permitted(features)
-        self._permitted = permitted if worlds is None else np.where(worlds[:, None], permitted, self._permitted)
         return features
 
     def act(self, observation: Array, residual: Array) -> npt.NDArray[np.float32]:
-        """Commands of the corrected base for a control step, under what is permitted of a residual."""
-        action, self._state = self.corrected.act(observation, residual * self._permitted, self._state, self._start)
+        """Commands of the corrected base for a control step."""
+        action, self._state = self.corrected.act(observation, residual, self._state, self._start)
         self._start = np.zeros_like(self._start)
         return action
 
