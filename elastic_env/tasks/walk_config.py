@@ -27,14 +27,6 @@ class WalkRewardWeights(Model):
 
     tilt: float = quantity("1/rad", 100.0, ge=0, description="per rad of pelvis error: 1 at 0.01 rad")
     zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, description="per m of ZMP deviation: 1 at 0.03 m")
-    drift: float = quantity(
-        "1/m",
-        0.0,
-        ge=0,
-        description="per m by which the loaded feet get further from their footholds; back again counts",
-    )
-    """A foot that lands beside its foothold costs ZMP in all that is left of the walk; paid when it happens, that
-    counts under a short discount too."""
     effort: float = quantity("1/(N·m)", 0.001, ge=0, description="per N·m of servo torque, rms over the joints")
     smoothness: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offsets, rms over joints")
     fall: float = quantity("1", 200.0, ge=0, description="once, at a fall or where the simulation diverges")

@@ -162,7 +162,6 @@ class WalkTask:
         self._offset, self._offset_before, self._command = np.zeros((3, n, m))
         self._contact_since, self._each = np.full(n, -1, dtype=np.int64), np.arange(n)
         self._fallen = np.zeros(n, dtype=np.bool_)
-        self._drift = self._drift_before = np.zeros(n)
         self._noise_spread = _noise_spread(config.scenario)
         steps, imu = np.arange(self.num_steps + 1), config.scenario.pelvis_imu
         self._imu_is_due = is_due(steps, imu.rate_hz, config.control_period_s)
@@ -190,7 +189,6 @@ class WalkTask:
         self._contact_since[worlds] = -1
         simulation.refresh(worlds)
         self._read(simulation, worlds)
-        self._drift = self._feet_drift()
         fresh = self._measure(worlds)
         at_rest = WalkMeasurement(fresh.encoder, fresh.encoder, fresh.body)
         self._measured = self._measured.with_worlds(worlds, at_rest)
@@ -218,8 +216,6 @@ class WalkTask:
         before, self._measured = self._measured, self._measure(healthy)
         self._shown = before if self.config.scenario.delay_steps else self._measured
         self._watch_swing_foot()
-        if self.config.reward.drift > 0.0:
-            self._drift_before, self._drift = self._drift, self._feet_drift()
 
     def observe(self) -> Array:
         """See the table of the module."""
@@ -288,14 +284,13 @@ class WalkTask:
         }
 
     def reward_terms(self, sample: WalkSample, diverged: BoolArray) -> dict[str, Array]:
-        """Weighted penalties for tilt, ZMP deviation, drift, effort, restless commands and a fall."""
+        """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
         weights, state = self.config.reward, sample.state
         deviation = state.zmp - self.plan.zmp.take(self._now, axis=0)
         counts = np.where(self._phases[0].take(self._now), 1.0, weights.standing)
         return {
             "tilt": weights.tilt * counts * tilt_penalty(state.attitude[:, 2]),
             "zmp": weights.zmp * counts * zmp_penalty(np.hypot(deviation[:, 0], deviation[:, 1])),
-            "drift": weights.drift * (self._drift_before - self._drift),
             "effort": -weights.effort * rms(state.servo_torque),
             "smoothness": -weights.smoothness * self._command_rate(sample),
             "fall": -weights.fall * (diverged | self._fallen),
@@ -406,13 +401,6 @@ class WalkTask:
         first = (half == SECOND_HALF) & loaded & (self._contact_since < 0)
         since = np.where(first, self._step, self._contact_since)
         self._contact_since = np.where(half == FIRST_HALF, -1, since)
-
-    def _feet_drift(self) -> Array:
-        """How far the feet stand from their footholds, each by its planned share of the load, (num_worlds,) [m]."""
-        share = self.plan.share.take(self._now)
-        on_each = np.stack([1.0 - share, share], axis=1)
-        beside = self._state.ankles[..., :2] - self._robot.footholds
-        return np.linalg.norm((on_each[..., None] * beside).sum(axis=1), axis=1)
 
     def _earliness(self, sample: WalkSample) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
