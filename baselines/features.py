@@ -69,7 +69,7 @@ class Features:
         period_s = settings.decision_period * model.control_period_s
         self._sources = [_source(name, model, period_s) for name in names]
         self._acts = BASE_ACTION in settings.observe
-        widths = [len(source.names) for source in self._sources]
+        widths = np.array([len(source.names) for source in self._sources], dtype=np.int64)
         is_measured = np.repeat([name.split(".")[0] in _MEASUREMENTS for name in names], widths)
         self._measured, self._history = np.flatnonzero(is_measured), settings.history
         past = self._history * len(self._measured)
@@ -105,7 +105,7 @@ class Features:
         memory, fresh = (begun, np.ones_like(fresh)) if memory is None else (memory, fresh)
         past, *memories = np.split(np.where(fresh[:, None], begun, memory), self._ends[:-1], axis=1)
         observed = [source.observe(rows, own) for source, own in zip(self._sources, memories, strict=True)]
-        seen = np.hstack([values for values, _ in observed])
+        seen = np.hstack([np.zeros((n, 0)), *(values for values, _ in observed)])
         measured = seen[:, self._measured]
         past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), past)
         parts = [seen]

@@ -399,6 +399,15 @@ def test_residuals_see_what_they_are_told_to() -> None:
     np.testing.assert_array_equal(seen[0, -6:], np.concatenate([rows[3][0, rates], rows[3][0, rates]]))
 
 
+def test_the_base_action_is_enough_to_see() -> None:
+    """Catches features that need a source beside it."""
+    env = scalar("testbed")
+    corrected = around(env, "input", observe=("base_action",))
+    rows, _ = env.reset(seed=0)
+    seen, _ = Features(corrected).at(rows[None], None, np.ones(1, dtype=np.bool_), None, None)
+    np.testing.assert_array_equal(seen, corrected.base_action(rows[None], None, None))
+
+
 @pytest.mark.parametrize(
     ("robot", "observe", "message"),
     [
