@@ -45,7 +45,7 @@ class ResidualSettings(Model):
     with `shared` corrections of the model, which are the same in the mirror."""
     cautious: bool = False
     """Whether it is played only as far as there is `evidence` that the model is wrong (`baselines.evidence`), and else
-    leaves the base alone. In training it acts freely. For a walker's residual that observes the evidence."""
+    leaves the base alone. In training it acts freely. For a walker."""
     observe: tuple[str, ...] = Field(default=("observation",), min_length=1)
     """What it sees: groups of the observation such as (clock, load_share), or all of it, and what
     `baselines.features` makes of it and of the plan."""

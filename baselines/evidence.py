@@ -15,6 +15,8 @@ count, where friction hides more of the bending than a small error would show. A
 import numpy as np
 
 from baselines.bending import BendingObserver
+from baselines.correction import Corrected
+from elastic_env.errors import ConfigurationError
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.robots.thormang import SIDES
 from elastic_env.signals import Array
@@ -31,7 +33,7 @@ _LOAD = BendingObserver.names.index("excess_load")
 
 
 class Evidence:
-    """A source of features: g, from 0 to 1.
+    """g, from 0 to 1, from the observations of a walker.
 
     Memory per world: number of measurements, the sum of their excess loads, then that of the observer.
 
@@ -39,8 +41,6 @@ class Evidence:
         model: Assumed walker.
         period_s: Time between two measurements.
     """
-
-    names = ("evidence",)
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
         self._bending, self._prior = BendingObserver(model), PRIOR_S / period_s
@@ -51,12 +51,42 @@ class Evidence:
         return np.hstack([np.zeros((num_worlds, 2)), self._bending.begin(num_worlds)])
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """G after a measurement, (num_worlds, m) to (num_worlds, 1), and the new memory."""
+        """Evidence after a measurement, (num_worlds, m) to (num_worlds, 1), and the new memory."""
         seen, kept = self._bending.observe(rows, memory[:, 2:])
         load = memory[:, :2] + np.column_stack([np.ones(len(rows)), seen[:, _LOAD]])
         excess_load = load[:, 1] / (self._prior + load[:, 0])
         g = evidence(seen[:, _ERROR], seen[:, _DEVIATION], excess_load)
         return g[:, None], np.hstack([load, kept])
+
+
+class Unreserved:
+    """Caution that lets everything pass; see `Evidence`."""
+
+    memory_width = 0
+
+    def begin(self, num_worlds: int) -> Array:
+        """No memory, (num_worlds, 0)."""
+        return np.zeros((num_worlds, 0))
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """Ones, (num_worlds, 1)."""
+        return np.ones((len(rows), 1)), memory
+
+
+def caution(corrected: Corrected) -> Evidence | Unreserved:
+    """What says how far a residual may act.
+
+    Raises:
+        ConfigurationError: Caution without a walker.
+    """
+    model, settings = corrected.model, corrected.settings
+    if not settings.cautious:
+        return Unreserved()
+    if not isinstance(model, WalkerModel):
+        raise ConfigurationError(
+            f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set cautious: false"
+        )
+    return Evidence(model, settings.decision_period * model.control_period_s)
 
 
 def evidence(model_error: Array, deviation: Array, excess_load: Array) -> Array:

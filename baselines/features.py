@@ -8,7 +8,6 @@
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.bending`) |
-| `evidence` | walker: how far that shows that the model is wrong, 0 to 1 (`baselines.evidence`) |
 | `base_action` | what the base alone would command now [rad] |
 """
 
@@ -19,7 +18,6 @@ import numpy as np
 
 from baselines.bending import BendingObserver
 from baselines.correction import Corrected
-from baselines.evidence import Evidence
 from baselines.ground_level import GroundLevel
 from baselines.mirror import LeftFirst
 from elastic_env.errors import ConfigurationError, unknown_name
@@ -28,7 +26,7 @@ from elastic_env.robots.thormang import SIDES
 from elastic_env.signals import Array, BoolArray
 from elastic_env.walking.ground_contact import FootSensors, zero_moment_point
 
-OBSERVATION, BASE_ACTION, EVIDENCE = "observation", "base_action", "evidence"
+OBSERVATION, BASE_ACTION = "observation", "base_action"
 _MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "wrench", "link_angle_imu")
 
 
@@ -60,7 +58,7 @@ class Features:
         corrected: The base and its correction.
 
     Raises:
-        ConfigurationError: A name that does not exist, or not for this robot; caution without evidence.
+        ConfigurationError: A name that does not exist, or not for this robot.
     """
 
     def __init__(self, corrected: Corrected) -> None:
@@ -81,9 +79,6 @@ class Features:
         self.memory_width = int(self._ends[-1])
         measured = [seen[i] for i in self._measured]
         self._mirror = LeftFirst(self.names, measured, corrected) if settings.mirror else None
-        if settings.cautious and EVIDENCE not in self.names:
-            raise ConfigurationError("cautious goes by the evidence against the model; add evidence to observe")
-        self._evidence = self.names.index(EVIDENCE) if settings.cautious else None
 
     def at(
         self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
@@ -117,10 +112,6 @@ class Features:
             features = self._mirror(rows, features)
         return features, np.hstack([remembered, *(kept for _, kept in observed)])
 
-    def permitted(self, features: Array) -> Array:
-        """Share of what is decided from features that is done, (num_worlds, width) to (num_worlds, 1), 0 to 1."""
-        return np.ones((len(features), 1)) if self._evidence is None else features[:, [self._evidence]]
-
 
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""
@@ -148,10 +139,7 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
         return GroundLevel(model, period_s)
     if isinstance(model, WalkerModel) and name == "bending":
         return BendingObserver(model)
-    if isinstance(model, WalkerModel) and name == EVIDENCE:
-        return Evidence(model, period_s)
-    of_a_walker = ["contact_error", "level", "bending", EVIDENCE]
-    further = ["encoder_error", *(of_a_walker if isinstance(model, WalkerModel) else [])]
+    further = ["encoder_error", *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
     raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
 
 

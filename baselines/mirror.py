@@ -41,7 +41,6 @@ _EVEN = {
     "clock.time",
     "clock.swing",
     "excess_load",
-    "evidence",
     *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fx", "fz", "my")),
     *(f"{group}.{axis}" for group in ("model_error", "uncertainty") for axis in ("roll", "pitch")),
 }

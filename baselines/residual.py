@@ -15,6 +15,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from baselines.correction import Corrected, ResidualSettings
+from baselines.evidence import caution
 from baselines.features import Features
 from baselines.policy import Action, ObservationView, Policy, resume
 from elastic_env.config import Model
@@ -127,14 +128,15 @@ class Network:
 class ResidualPolicy:
     """A base policy with a network that corrects it.
 
-    Memory per world: control steps since the last decision, the residual that was decided, earlier measurements.
+    Memory per world: control steps since the last decision, the residual that was decided, that of the features, and
+    that of caution.
 
     Args:
         corrected: The base and its correction.
         network: What decides.
 
     Raises:
-        ConfigurationError: The network does not fit the settings.
+        ConfigurationError: The network does not fit the settings, or they do not fit the robot.
     """
 
     def __init__(self, corrected: Corrected, network: Network) -> None:
@@ -147,6 +149,8 @@ class ResidualPolicy:
                 f"it has {network.num_features} and {network.num_outputs}"
             )
         model = corrected.model
+        self._caution = caution(corrected)
+        self._ends = np.cumsum([1, corrected.num_residuals, self._features.memory_width])
         self._view = ObservationView(model.observation_table, model.control_period_s)
 
     def predict(
@@ -158,17 +162,18 @@ class ResidualPolicy:
     ) -> tuple[Action, Any]:
         """Corrected action and new state."""
         rows = self._view.rows(observation)
-        k, width = self.corrected.num_residuals, 1 + self.corrected.num_residuals + self._features.memory_width
-        memory, inner = resume(state, episode_start, rows, self._view, lambda: self._undecided((len(rows), width)))
+        memory, inner = resume(state, episode_start, rows, self._view, lambda: self._undecided(len(rows)))
         due = np.flatnonzero((memory[:, 0] == 0.0) | (memory[:, 0] == _UNDECIDED))
         if len(due) > 0:
             memory = memory.copy()
             fresh = memory[:, 0] == _UNDECIDED
-            features, past = self._features.at(rows, memory[:, 1 + k :], fresh, inner, episode_start)
-            decided = self._network(features[due]) * self._features.permitted(features[due])
-            memory[due, 1 : 1 + k], memory[due, 1 + k :] = decided, past[due]
-            memory[due, 0] = 0.0
-        action, inner = self.corrected.act(observation, memory[:, 1 : 1 + k], inner, episode_start)
+            _, _, past, known = np.split(memory, self._ends, axis=1)
+            features, past = self._features.at(rows, past, fresh, inner, episode_start)
+            trust, known = self._caution.observe(rows, np.where(fresh[:, None], self._caution.begin(len(rows)), known))
+            decided = self._network(features[due]) * trust[due]
+            memory[due] = np.hstack([np.zeros((len(due), 1)), decided, past[due], known[due]])
+        residual = memory[:, self._ends[0] : self._ends[1]]
+        action, inner = self.corrected.act(observation, residual, inner, episode_start)
         counted = memory.copy()
         counted[:, 0] = (memory[:, 0] + 1.0) % self._period
         return action, (counted, inner)
@@ -177,8 +182,8 @@ class ResidualPolicy:
         """See `Corrected`."""
         return self.corrected.link_estimate(observation, state[1])
 
-    def _undecided(self, shape: tuple[int, int]) -> Array:
-        memory = np.zeros(shape)
+    def _undecided(self, num_worlds: int) -> Array:
+        memory = np.zeros((num_worlds, self._ends[-1] + self._caution.memory_width))
         memory[:, 0] = _UNDECIDED
         return memory
 

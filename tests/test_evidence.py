@@ -10,11 +10,10 @@ import pytest
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.correction import Corrected, ResidualSettings
-from baselines.evidence import EXCESS_LOAD, MODEL_ERROR, Evidence, evidence
+from baselines.evidence import EXCESS_LOAD, MODEL_ERROR, Evidence, caution, evidence
 from baselines.features import Features
 from baselines.residual import Network, ResidualDescription, ResidualPolicy
 from elastic_env.errors import ConfigurationError
-from train.residual_env import ResidualWrapper
 
 HIP_ROLLS = [1, 7]
 
@@ -49,7 +48,7 @@ def walk(scenario: str, cautious: bool) -> tuple[Any, Any]:
         scenario=scenario, step_period=1.6, num_steps=2, num_threads=1,
     )  # fmt: skip
     model, base = envs.unwrapped.assumed_model, baselines.make("input_output", envs)
-    chosen = ResidualSettings(scale=0.05, joints=("hip_roll",), observe=("clock", "evidence"), cautious=cautious)
+    chosen = ResidualSettings(scale=0.05, joints=("hip_roll",), observe=("clock",), cautious=cautious)
     corrected = Corrected(base, model, chosen)
     width = Features(corrected).width
     tensors = {"mean": np.zeros(width), "std": np.ones(width), "weight0": np.zeros((2, width)), "bias0": np.ones(2)}
@@ -86,8 +85,9 @@ def test_a_cautious_residual_acts_as_far_as_there_is_evidence() -> None:
     assert np.abs(right).max() < 0.1 * 0.05
 
 
-def test_what_sees_no_evidence_cannot_be_cautious() -> None:
+def test_only_a_walker_can_be_cautious() -> None:
     """Catches a residual that is cautious in name only."""
-    env = gymnasium.make("elastic_env/WalkInPlace-v0")
-    with pytest.raises(ConfigurationError, match="add evidence to observe"):
-        ResidualWrapper(env, "input_output", observe=("bending",), cautious=True)
+    env: Any = gymnasium.make("elastic_env/Testbed-v0")
+    corrected = Corrected(baselines.make("input", env), env.unwrapped.assumed_model, ResidualSettings(cautious=True))
+    with pytest.raises(ConfigurationError, match="set cautious: false"):
+        caution(corrected)

@@ -85,7 +85,7 @@ def test_what_a_residual_sees_of_a_mirrored_walk_is_the_mirror_image() -> None:
     """Catches a feature whose sign or side in the mirror is wrong, on a robot whose joints differ from each other."""
     env = walker(scenario="spread", num_steps=1)
     model, rows = model_of(env), walked(env)[::20]
-    observe = ("observation", "encoder_error", "contact_error", "level", "bending", "evidence", "base_action")
+    observe = ("observation", "encoder_error", "contact_error", "level", "bending", "base_action")
     features, seen = features_of(env, rows, observe=observe)
     _, reflected = features_of(env, Mirror(model.observation_table.names, model.biped)(rows), observe=observe)
     expected = Mirror(features.names, model.biped)(seen)
