@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from baselines.policy import Action, ObservationView, Policy, resume
 from elastic_env.config import Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.robots.robot_model import RobotModel
+from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.signals import Array, BoolArray, IntArray
 
 Space = Literal["joint", "model"]
@@ -45,7 +45,7 @@ class ResidualSettings(Model):
     with `shared` corrections of the model, which are the same in the mirror."""
     cautious: bool = False
     """Whether it is played only as far as there is `evidence` that the model is wrong (`baselines.evidence`), and else
-    leaves the base alone. In training it acts freely. For a walker."""
+    leaves the base alone. In training, under the wrappers of `train`, it acts freely. For a walker."""
     observe: tuple[str, ...] = Field(default=("observation",), min_length=1)
     """What it sees: groups of the observation such as (clock, load_share), or all of it, and what
     `baselines.features` makes of it and of the plan."""
@@ -121,7 +121,8 @@ class Corrected:
         settings: How the residual acts.
 
     Raises:
-        ConfigurationError: `model` around a policy that compensates nothing, or a joint that the robot has not.
+        ConfigurationError: `model` around a policy that compensates nothing, a joint that the robot has not, or caution
+            without a walker.
     """
 
     def __init__(self, base: Policy, model: RobotModel, settings: ResidualSettings) -> None:
@@ -129,6 +130,10 @@ class Corrected:
             raise ConfigurationError(
                 f"a residual in space 'model' corrects the deflection that its base compensates, and "
                 f"{type(base).__name__} compensates none; use space 'joint', or a base such as input_output"
+            )
+        if settings.cautious and not isinstance(model, WalkerModel):
+            raise ConfigurationError(
+                f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set cautious: false"
             )
         self.base, self.settings, self.model = base, settings, model
         self.joints = settings.corrected_joints(model.joint_names)

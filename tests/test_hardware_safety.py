@@ -28,7 +28,7 @@ PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
 """Limits for tests of other things: a busy computer delays pseudo-terminals."""
 
 pytestmark = pytest.mark.flaky(reruns=2, only_rerun="no usable reply")
-"""Nor does it let any process run for 40 ms at times, which is a fault, and rightly ends the motion."""
+"""At times it lets no process run for 40 ms: a fault, which rightly ends the motion."""
 
 
 def states(position: list[float], velocity: float = 0.0, current: float = 0.0, fresh: bool = True) -> States:

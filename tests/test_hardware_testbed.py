@@ -31,7 +31,7 @@ PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
 """A busy computer delays pseudo-terminals."""
 
 pytestmark = pytest.mark.flaky(reruns=2, only_rerun="no usable reply")
-"""Nor does it let any process run for 40 ms at times, which is a fault, and rightly ends the motion."""
+"""At times it lets no process run for 40 ms: a fault, which rightly ends the motion."""
 
 
 @pytest.fixture(scope="module")
