@@ -678,15 +678,20 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
     monkeypatch.setattr(train.demo, "_SLOW_WALK", train.demo._SLOW_WALK.replace(references=[short_walk]))
     monkeypatch.setattr(train.demo, "_WALK", train.demo._WALK.replace(references=[short_walk]))
+    monkeypatch.setattr(train.demo, "_SOFT_WALK", train.demo._SOFT_WALK.replace(references=[short_walk]))
     main(["demo"])
     printed = capsys.readouterr().out
-    walks = {"pelvis_0.3+0.5+0.3_s_num_steps=1_nominal.png", "zmp_0.3+0.5+0.3_s_num_steps=1_nominal.png"}
+    walks = {
+        f"{name}_0.3+0.5+0.3_s_num_steps=1_{scenario}.png"
+        for name in ("pelvis", "zmp")
+        for scenario in ("nominal", "soft")
+    }
     names = {"fig5_identification.png", "fig6_static_errors.png", "sine.png", "identification.json", *walks}
     names |= {"episodes.csv", "summary.md"}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}
     assert [name for name in names if f"runs/demo/{name}" not in printed] == []
     of_the_paper = ("Pearson r", "0.9775", "-56.2 to +41.7", "about 40", "below 10")
-    policies = ("uncompensated", "input", "dynamic", "oracle", "input_output", "input_wrench")
+    policies = ("uncompensated", "input", "dynamic", "oracle", "input_output", "input_wrench", "residual")
     assert [text for text in (*of_the_paper, *policies) if text not in printed] == []
 
 
