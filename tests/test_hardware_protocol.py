@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from elastic_env.errors import ConfigurationError
 from elastic_env.hardware import protocol
-from elastic_env.hardware.control_table import explain_errors, servo_model, servo_models
+from elastic_env.hardware.control_table import NUM_BLOCKS, explain_errors, servo_model, servo_models
 from elastic_env.hardware.emulator.mip import attitude_packet, checksum
 from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.hardware.torque_line import current_of_torque, torque_of_current
 
 # of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
@@ -92,9 +93,16 @@ def test_registers_do_not_overlap_and_blocks_are_of_whole_registers(number: int)
     model = servo_model(number)
     registers = list(model.table.values())
     assert all(a.end <= b.address for a, b in itertools.pairwise(registers))
-    assert len(set(model.block_lengths)) == 4
-    for length in model.block_lengths:
-        assert model.block_address + length in {register.end for register in registers}
+    lengths = {len(block) for block in model.blocks}
+    assert len(lengths) == len(model.blocks) == NUM_BLOCKS
+    assert SafetyLimits(patience_cycles=10).patience_cycles == 10
+    with pytest.raises(ConfigurationError, match="patience_cycles"):  # a motion ends before a length comes again
+        SafetyLimits(patience_cycles=len(lengths))
+    for block in model.blocks:
+        assert block.start in {register.address for register in registers}
+        assert block.stop in {register.end for register in registers}
+        for name in ("present_position", "present_velocity", "present_current"):
+            assert block.start <= model.table[name].address < model.table[name].end <= block.stop
 
 
 def test_units_are_the_makers() -> None:

@@ -1,10 +1,11 @@
 """Servos on one port, in SI units: registers, the goals of all servos in one packet, their states in another.
 
-A state is read as one block per servo. Each request asks for another length than the last ones
-(`ServoModel.block_lengths`), so that a reply that comes late is known as old and left out, not taken for the next one.
+A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none of the last ones
+still awaits, so that a reply that comes late is known as old and left out, not taken for the present one's.
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.hardware import protocol
-from elastic_env.hardware.control_table import ServoModel, servo_model
+from elastic_env.hardware.control_table import NUM_BLOCKS, ServoModel, servo_model
 from elastic_env.hardware.errors import HardwareError, ReplyError
 from elastic_env.hardware.port import COMM_SUCCESS, DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
 from elastic_env.signals import Array, BoolArray
@@ -70,7 +71,7 @@ class Bus:
         self.models: dict[int, ServoModel] = {}
         self.num_retries = 0
         self._handler = PacketHandler()
-        self._requests = 0
+        self._awaited: deque[range | None] = deque(maxlen=NUM_BLOCKS - 1)  # by the last requests; None: all answered
 
     def open(self) -> None:
         """Open and lock the port.
@@ -126,7 +127,7 @@ class Bus:
         """
         protocol.require_ids(ids)
         self.models = {servo_id: servo_model(self.ping(servo_id).model_number) for servo_id in ids}
-        if len({model.block_address for model in self.models.values()}) > 1:
+        if len({model.blocks for model in self.models.values()}) > 1:
             names = ", ".join(f"{servo_id}: {model.name}" for servo_id, model in self.models.items())
             raise HardwareError(f"the servos of one bus must have one control table, at {self.name} are {names}")
 
@@ -209,15 +210,15 @@ class Bus:
         Raises:
             BusGoneError: The port is gone.
         """
-        self._requests += 1
-        some = next(iter(self.models.values()))
-        length = some.block_lengths[self._requests % len(some.block_lengths)]
-        asked = some.block_address.to_bytes(2, "little") + length.to_bytes(2, "little")
+        blocks = next(iter(self.models.values())).blocks
+        block = next(block for block in blocks if block not in self._awaited)
+        self._awaited.append(block)
+        asked = block.start.to_bytes(2, "little") + len(block).to_bytes(2, "little")
         self._send(protocol.BROADCAST, protocol.SYNC_READ, asked + bytes(self.ids))
         self.port.setPacketTimeoutMillis(1e3 * timeout_s)
-        blocks: dict[int, bytes] = {}
+        replies: dict[int, bytes] = {}
         alerts: set[int] = set()
-        while len(blocks) < len(self.ids):
+        while len(replies) < len(self.ids):
             reply = self._receive()
             if reply is None:
                 if self.port.getTimeSinceStart() >= 1e3 * timeout_s:
@@ -226,18 +227,20 @@ class Bus:
             servo_id, error, data = reply
             if error & protocol.ALERT:
                 alerts.add(servo_id)
-            if len(data) == length and error & ~protocol.ALERT == 0 and servo_id in self.models:
-                blocks[servo_id] = data
-        return self._states(blocks, alerts)
+            if len(data) == len(block) and error & ~protocol.ALERT == 0 and servo_id in self.models:
+                replies[servo_id] = data
+        if len(replies) == len(self.ids):
+            self._awaited[-1] = None
+        return self._states(block, replies, alerts)
 
-    def _states(self, blocks: Mapping[int, bytes], alerts: set[int]) -> States:
+    def _states(self, block: range, replies: Mapping[int, bytes], alerts: set[int]) -> States:
         values = np.full((3, len(self.ids)), np.nan)
         for column, (servo_id, model) in enumerate(self.models.items()):
-            if servo_id in blocks:
-                values[0, column] = model.in_block("present_position", blocks[servo_id]) * model.position_unit
-                values[1, column] = model.in_block("present_velocity", blocks[servo_id]) * model.velocity_unit
-                values[2, column] = model.in_block("present_current", blocks[servo_id]) * model.current_unit
-        is_fresh = np.array([servo_id in blocks for servo_id in self.ids])
+            if servo_id in replies:
+                values[0, column] = model.in_block("present_position", block, replies[servo_id]) * model.position_unit
+                values[1, column] = model.in_block("present_velocity", block, replies[servo_id]) * model.velocity_unit
+                values[2, column] = model.in_block("present_current", block, replies[servo_id]) * model.current_unit
+        is_fresh = np.array([servo_id in replies for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
         return States(*values, is_fresh=is_fresh, has_alert=has_alert, time_s=time.monotonic())
 

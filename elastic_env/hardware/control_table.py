@@ -16,6 +16,8 @@ from elastic_env.hardware.errors import HardwareError
 
 _RPM = 2.0 * math.pi / 60.0
 _BLOCK = ("present_position", "present_velocity", "present_current")
+NUM_BLOCKS = 24
+"""Ways to read a servo's state; one is known as old for so many requests: 96 ms, over twice the longest patience."""
 
 
 @dataclass(frozen=True)
@@ -108,26 +110,23 @@ class ServoModel:
         return "bus_watchdog" in self.table
 
     @functools.cached_property
-    def block_address(self) -> int:
-        """Where the block begins that holds position, velocity and current."""
-        return min(self.table[name].address for name in _BLOCK)
+    def blocks(self) -> tuple[range, ...]:
+        """Addresses of the blocks that hold position, velocity and current: whole registers, each longer than the last.
 
-    @functools.cached_property
-    def block_lengths(self) -> tuple[int, ...]:
-        """Four lengths in which that block can be read, each with one register more.
-
-        Requests take them in turn, so that a reply's length tells which request it answers: the servos' protocol has
-        no other mark of that, and a reply that comes late would pass for the next one.
+        The length of a reply tells which request it answers; the protocol has no other mark of that.
         """
-        shortest = max(self.table[name].end for name in _BLOCK)
-        ends = [register.end for register in self.table.values() if register.end >= shortest]
-        return tuple(end - self.block_address for end in ends[:4])
+        registers = self.table.values()
+        first, last = min(self.table[name].address for name in _BLOCK), max(self.table[name].end for name in _BLOCK)
+        starts = [register.address for register in registers if register.address <= first]
+        ends = [register.end for register in registers if register.end >= last]
+        by_length = {end - start: range(start, end) for start in starts for end in ends}
+        return tuple(by_length[length] for length in sorted(by_length)[:NUM_BLOCKS])
 
-    def in_block(self, name: str, block: bytes) -> int:
-        """Value of a register within the block, [count]."""
+    def in_block(self, name: str, block: range, data: bytes) -> int:
+        """Value of a register within the data of a block, [count]."""
         register = self.table[name]
-        start = register.address - self.block_address
-        return register.decode(block[start : start + register.size])
+        start = register.address - block.start
+        return register.decode(data[start : start + register.size])
 
 
 def servo_model(number: int) -> ServoModel:
