@@ -1,6 +1,7 @@
 """Packets and control tables: against the maker's examples, the SDK's own functions, and random bytes."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from elastic_env.errors import ConfigurationError
 from elastic_env.hardware import protocol
+from elastic_env.hardware.bus import Bus
 from elastic_env.hardware.control_table import NUM_BLOCKS, explain_errors, servo_model, servo_models
 from elastic_env.hardware.emulator.mip import attitude_packet, checksum
 from elastic_env.hardware.errors import HardwareError
@@ -103,6 +105,39 @@ def test_registers_do_not_overlap_and_blocks_are_of_whole_registers(number: int)
         assert block.stop in {register.end for register in registers}
         for name in ("present_position", "present_velocity", "present_current"):
             assert block.start <= model.table[name].address < model.table[name].end <= block.stop
+
+
+@given(st.lists(st.sampled_from([0, 0, 1, 2, 4, 10, NUM_BLOCKS - 1, math.inf]), max_size=60))
+def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float]) -> None:
+    """Catches a reply of some cycles ago that passes as new; each says in its position which request it answers."""
+    model = servo_model(54024)
+    position = model.table["present_position"]
+    on_the_way: dict[float, list[bytes]] = {}
+
+    class Line(Bus):
+        """A bus whose servo answers a request so many requests later."""
+
+        requests = 0
+
+        def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+            assert (servo_id, instruction) == (protocol.BROADCAST, protocol.SYNC_READ)
+            start, length = (int.from_bytes(parameters[i : i + 2], "little") for i in (0, 2))
+            reply = bytearray(length)
+            at = position.address - start
+            reply[at : at + position.size] = position.encode(self.requests)
+            on_the_way.setdefault(self.requests + lateness[self.requests], []).append(bytes(reply))
+
+        def _receive(self) -> tuple[int, int, bytes] | None:
+            waiting = on_the_way.get(self.requests)
+            return (1, 0, waiting.pop(0)) if waiting else None
+
+    bus = Line("nowhere")
+    bus.models = {1: model}
+    for bus.requests, late in enumerate(lateness):
+        states = bus.read_states(0.0)
+        assert states.is_fresh.tolist() == [late == 0]
+        if late == 0:
+            assert states.position == pytest.approx([bus.requests * model.position_unit])
 
 
 def test_units_are_the_makers() -> None:
