@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -76,7 +77,7 @@ class EpisodeMetrics:
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
         self._metrics = tuple(metrics)
         rows = sorted({(m.signal, m.over) for m in metrics})
-        self._row = {row: number for number, row in enumerate(rows)}
+        self._row = MappingProxyType({row: number for number, row in enumerate(rows)})
         self._signals = [signal for signal, _ in rows]
         self._masks = list(dict.fromkeys(over for _, over in rows))
         self._mask_of_row = np.array([self._masks.index(over) for _, over in rows])

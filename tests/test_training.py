@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -199,6 +200,33 @@ def test_a_state_of_something_else_is_refused() -> None:
     older["attributes"]["renamed_since"] = 0
     with pytest.raises(ElasticError, match=r"another version .* renamed_since; resume it with that version"):
         restore(wrapped("testbed", 2), older)
+
+
+class Foreign:
+    """A policy of somebody else, with some memory."""
+
+    def __init__(self, **memory: Any) -> None:
+        self.generator, self.count = np.random.default_rng(0), 0
+        self.sum = np.zeros(2)
+        vars(self).update(memory)
+
+
+def test_the_memory_of_a_policy_of_ones_own_is_in_the_state() -> None:
+    """Catches a state that knows classes of ours alone."""
+    one, other = Foreign(parts=[Foreign()]), Foreign(parts=[Foreign()])
+    one.generator.random(), one.parts[0].generator.random()
+    one.count, one.sum = 3, np.array([1.0, 2.0])
+    restore(other, capture(one))
+    assert (other.count, other.sum.tolist()) == (3, [1.0, 2.0])
+    assert other.generator.random() == one.generator.random()
+    assert other.parts[0].generator.random() == one.parts[0].generator.random()
+
+
+@pytest.mark.parametrize("memory", [{1, 2}, threading.Lock(), {1: 2}, [1, max], iter([])])
+def test_what_a_state_cannot_hold_is_refused(memory: Any) -> None:
+    """Catches memory that is left out of a checkpoint, so that a training goes on differently."""
+    with pytest.raises(ElasticError, match=r"a checkpoint cannot hold Foreign\.memory"):
+        capture(Foreign(memory=memory))
 
 
 def test_a_mixture_is_its_parts() -> None:

@@ -1,17 +1,25 @@
 """State of environments, policies and random generators as arrays and plain values, for checkpoints.
 
-The state of an object of ours is that of its attributes: arrays that can be written to, random generators, plain
-values, records of rows, and containers and objects of these. What cannot change is left out: read-only arrays, frozen
-models, compiled physics models, functions. Nothing is pickled: a state is arrays and JSON.
+The state of an object is that of its attributes: arrays that can be written to, random generators, plain values,
+records of rows, and containers and objects of these. What does not change is left out: read-only arrays, frozen
+models, compiled physics models, functions. Anything else is refused, so that no state is left out that would be missed
+when a training goes on. Nothing is pickled: a state is arrays and JSON.
 """
 
 import json
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Executor
+from enum import Enum
+from functools import partial
 from pathlib import Path
+from types import BuiltinFunctionType, FunctionType, MappingProxyType, MethodType
 from typing import Any
 
 import numpy as np
+from gymnasium import Space
+from gymnasium.envs.registration import EnvSpec
+from mujoco import MjModel
 
 from elastic_env.config import Model
 from elastic_env.errors import ElasticError
@@ -20,8 +28,10 @@ from elastic_env.signals import Array
 from elastic_env.simulation import ManyWorlds
 from elastic_env.worlds import Worlds
 
-_OURS = ("elastic_env", "baselines", "train")
 _PLAIN = (bool, int, float, str, type(None))
+_FUNCTIONS = (FunctionType, MethodType, BuiltinFunctionType, partial)
+_FIXED = (*_FUNCTIONS, Model, Enum, MappingProxyType, MjModel, Space, EnvSpec, Executor, slice)
+"""Types whose objects do not change, or whose changes make no difference to what comes."""
 _ARRAY, _TUPLE, _ROWS, _GENERATOR = "array", "tuple", "rows", "generator"
 
 
@@ -109,25 +119,36 @@ class _Captured:
         self._seen.add(id(value))
         if isinstance(value, Worlds):
             value.score_samples()
-        attributes = {name: part for name, part in vars(value).items() if self._changes(part)}
-        return {
-            "object": type(value).__name__,
-            "attributes": {name: self.of(part) for name, part in attributes.items()},
-        }
+        kind = type(value).__name__
+        attributes = {name: part for name, part in vars(value).items() if self._changes(part, f"{kind}.{name}")}
+        return {"object": kind, "attributes": {name: self.of(part) for name, part in attributes.items()}}
 
-    def _changes(self, value: Any) -> bool:
-        """Whether an attribute has state that can change."""
+    def _changes(self, value: Any, owner: str) -> bool:
+        """Whether an attribute has state that can change, and that is not taken yet."""
         if isinstance(value, (*_PLAIN, np.generic, np.random.Generator, Rows, ManyWorlds)):
             return True
         if isinstance(value, np.ndarray):
             return value.flags.writeable and value.dtype != object
         if isinstance(value, tuple | list | deque):
-            return all(self._changes(part) for part in value)
-        if isinstance(value, dict):
-            return all(isinstance(name, str) and self._changes(part) for name, part in value.items())
-        module = type(value).__module__.split(".")[0]
-        frozen = isinstance(value, Model) or getattr(type(value), "__dataclass_params__", None) is not None
-        return module in _OURS and not frozen and hasattr(value, "__dict__") and id(value) not in self._seen
+            return self._all_change(value, owner)
+        if isinstance(value, dict) and all(isinstance(name, str) for name in value):
+            return self._all_change(value.values(), owner)
+        if id(value) in self._seen or isinstance(value, _FIXED) or _is_frozen(value):
+            return False
+        if hasattr(value, "__dict__"):
+            return True
+        raise ElasticError(f"a checkpoint cannot hold {owner}, an object of {type(value).__name__}")
+
+    def _all_change(self, parts: Iterable[Any], owner: str) -> bool:
+        changing = [self._changes(part, owner) for part in parts]
+        if any(changing) and not all(changing):
+            raise ElasticError(f"a checkpoint cannot hold {owner}: some of its parts change and others do not")
+        return all(changing)
+
+
+def _is_frozen(value: Any) -> bool:
+    parameters = getattr(type(value), "__dataclass_params__", None)
+    return parameters is not None and parameters.frozen
 
 
 def write_state(folder: Path, name: str, state: Any) -> None:
