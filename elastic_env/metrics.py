@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -77,7 +76,7 @@ class EpisodeMetrics:
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
         self._metrics = tuple(metrics)
         rows = sorted({(m.signal, m.over) for m in metrics})
-        self._row = MappingProxyType({row: number for number, row in enumerate(rows)})
+        self._row_of_metric = [rows.index((m.signal, m.over)) for m in metrics]
         self._signals = [signal for signal, _ in rows]
         self._masks = list(dict.fromkeys(over for _, over in rows))
         self._mask_of_row = np.array([self._masks.index(over) for _, over in rows])
@@ -95,4 +94,7 @@ class EpisodeMetrics:
 
     def values(self) -> dict[str, Array]:
         """Metrics so far, (num_worlds,) each; nan where no step was sampled."""
-        return {m.name: self._statistics.statistic(m.statistic, self._row[m.signal, m.over]) for m in self._metrics}
+        return {
+            metric.name: self._statistics.statistic(metric.statistic, row)
+            for metric, row in zip(self._metrics, self._row_of_metric, strict=True)
+        }

@@ -13,7 +13,7 @@ from concurrent.futures import Executor
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from types import BuiltinFunctionType, FunctionType, MappingProxyType, MethodType
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ from elastic_env.worlds import Worlds
 
 _PLAIN = (bool, int, float, str, type(None))
 _FUNCTIONS = (FunctionType, MethodType, BuiltinFunctionType, partial)
-_FIXED = (*_FUNCTIONS, Model, Enum, MappingProxyType, MjModel, Space, EnvSpec, Executor, slice)
+_FIXED = (*_FUNCTIONS, Model, Enum, MjModel, Space, EnvSpec, Executor, slice)
 """Types whose objects do not change, or whose changes make no difference to what comes."""
 _ARRAY, _TUPLE, _ROWS, _GENERATOR = "array", "tuple", "rows", "generator"
 
