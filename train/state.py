@@ -32,6 +32,7 @@ _PLAIN = (bool, int, float, str, type(None))
 _FUNCTIONS = (FunctionType, MethodType, BuiltinFunctionType, partial)
 _FIXED = (*_FUNCTIONS, Model, Enum, MjModel, Space, EnvSpec, Executor, slice)
 """Types whose objects do not change, or whose changes make no difference to what comes."""
+_HELD = "it holds numbers, arrays, random generators, and lists, dictionaries by name and objects of these alone"
 _ARRAY, _TUPLE, _ROWS, _GENERATOR = "array", "tuple", "rows", "generator"
 
 
@@ -137,12 +138,12 @@ class _Captured:
             return False
         if hasattr(value, "__dict__"):
             return True
-        raise ElasticError(f"a checkpoint cannot hold {owner}, an object of {type(value).__name__}")
+        raise ElasticError(f"a checkpoint cannot hold {owner}, an object of {type(value).__name__}; {_HELD}")
 
     def _all_change(self, parts: Iterable[Any], owner: str) -> bool:
         changing = [self._changes(part, owner) for part in parts]
         if any(changing) and not all(changing):
-            raise ElasticError(f"a checkpoint cannot hold {owner}: some of its parts change and others do not")
+            raise ElasticError(f"a checkpoint cannot hold {owner}, some of whose parts change and others not; {_HELD}")
         return all(changing)
 
 
