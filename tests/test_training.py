@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 import yaml
 from gymnasium.vector import AutoresetMode
 
@@ -213,13 +214,15 @@ class Foreign:
 
 def test_the_memory_of_a_policy_of_ones_own_is_in_the_state() -> None:
     """Catches a state that knows classes of ours alone."""
-    one, other = Foreign(parts=[Foreign()]), Foreign(parts=[Foreign()])
+    network = torch.nn.Linear(2, 1)  # which being played does not change
+    one, other = Foreign(parts=[Foreign()], network=network), Foreign(parts=[Foreign()], network=network)
     one.generator.random(), one.parts[0].generator.random()
     one.count, one.sum = 3, np.array([1.0, 2.0])
     restore(other, capture(one))
     assert (other.count, other.sum.tolist()) == (3, [1.0, 2.0])
     assert other.generator.random() == one.generator.random()
     assert other.parts[0].generator.random() == one.parts[0].generator.random()
+    assert other.network is network
 
 
 @pytest.mark.parametrize("memory", [{1, 2}, threading.Lock(), {1: 2}, [1, max], iter([])])

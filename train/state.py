@@ -2,8 +2,8 @@
 
 The state of an object is that of its attributes: arrays that can be written to, random generators, plain values,
 records of rows, and containers and objects of these. What does not change is left out: read-only arrays, frozen
-models, compiled physics models, functions. Anything else is refused, so that no state is left out that would be missed
-when a training goes on. Nothing is pickled: a state is arrays and JSON.
+models, compiled physics models, functions, networks. Anything else is refused, so that no state is left out that would
+be missed when a training goes on. Nothing is pickled: a state is arrays and JSON.
 """
 
 import json
@@ -134,7 +134,7 @@ class _Captured:
             return self._all_change(value, owner)
         if isinstance(value, dict) and all(isinstance(name, str) for name in value):
             return self._all_change(value.values(), owner)
-        if id(value) in self._seen or isinstance(value, _FIXED) or _is_frozen(value):
+        if id(value) in self._seen or isinstance(value, _FIXED) or _is_frozen(value) or _is_network(value):
             return False
         if hasattr(value, "__dict__"):
             return True
@@ -150,6 +150,11 @@ class _Captured:
 def _is_frozen(value: Any) -> bool:
     parameters = getattr(type(value), "__dataclass_params__", None)
     return parameters is not None and parameters.frozen
+
+
+def _is_network(value: Any) -> bool:
+    """Whether it is of torch or SB3, told by name, as the classes would load torch: a policy played does not change."""
+    return any(kind.__module__.split(".")[0] in ("torch", "stable_baselines3") for kind in type(value).__mro__)
 
 
 def write_state(folder: Path, name: str, state: Any) -> None:
