@@ -1,6 +1,6 @@
 """Scores of an episode from the samples of its steps: RMS, peak, range, mean. One row per world."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,79 +22,86 @@ class Metric:
     over: str = "scored"
 
 
-class RunningStatistics:
-    """Sum, sum of squares, smallest, largest and count of the rows of an array, in every world.
+@dataclass(frozen=True)
+class _Fold:
+    """How a statistic comes about: what is taken of a sample, how that of two is joined, and what changes nothing."""
 
-    A row that was never sampled has the statistics nan, not zero.
-    """
+    taken: Callable[[Array], Array]
+    joined: np.ufunc
+    neutral: float
 
-    def __init__(self, num_rows: int, num_worlds: int) -> None:
-        shape = (num_rows, num_worlds)
-        self._sum, self._sum_of_squares = np.zeros(shape), np.zeros(shape)
-        self._low, self._high = np.full(shape, np.inf), np.full(shape, -np.inf)
-        self._count = np.zeros(shape, dtype=np.int64)
+
+_FOLDS = {
+    "rms": _Fold(np.square, np.add, 0.0),
+    "mean": _Fold(np.positive, np.add, 0.0),
+    "min": _Fold(np.positive, np.minimum, np.inf),
+    "max": _Fold(np.positive, np.maximum, -np.inf),
+    "peak": _Fold(np.abs, np.maximum, 0.0),
+    "count": _Fold(np.ones_like, np.add, 0.0),
+}
+
+
+class RunningStatistic:
+    """One statistic of the rows of an array, over the steps at which they were sampled, in every world."""
+
+    def __init__(self, name: str, num_rows: int, num_worlds: int) -> None:
+        self._name = name
+        self._total = np.full((num_rows, num_worlds), _FOLDS[name].neutral)
+        self._count = np.zeros((num_rows, num_worlds), dtype=np.int64)
 
     def restart(self, worlds: BoolArray) -> None:
         """Forget the samples of some worlds, (num_worlds,) mask."""
-        self._sum[:, worlds] = self._sum_of_squares[:, worlds] = 0.0
-        self._low[:, worlds], self._high[:, worlds] = np.inf, -np.inf
+        self._total[:, worlds] = _FOLDS[self._name].neutral
         self._count[:, worlds] = 0
 
     def update(self, values: Array, sampled: BoolArray) -> None:
-        """Take the samples of some steps where `sampled` is true, (num_steps, num_rows, num_worlds) both.
+        """Take the samples of some steps where `sampled` is true, (num_rows, num_steps, num_worlds) both.
 
         The result does not depend on how many steps are taken at once.
         """
-        counted = np.where(sampled, values, 0.0)  # where, not a product: a nan outside does not count
-        squares = counted * counted
-        for value, square in zip(counted, squares, strict=True):
-            self._sum += value
-            self._sum_of_squares += square
-        np.minimum(self._low, np.where(sampled, values, np.inf).min(axis=0), out=self._low)
-        np.maximum(self._high, np.where(sampled, values, -np.inf).max(axis=0), out=self._high)
-        self._count += sampled.sum(axis=0)
+        fold = _FOLDS[self._name]
+        # where, not a product: a nan outside does not count
+        taken = np.where(sampled, fold.taken(values), fold.neutral).swapaxes(0, 1)
+        self._count += sampled.sum(axis=1)
+        if fold.joined is not np.add:
+            taken = fold.joined.reduce(taken, axis=0, keepdims=True, initial=fold.neutral)
+        for step in taken:  # sums in the order of the steps
+            fold.joined(self._total, step, out=self._total)
 
-    def statistic(self, name: str, row: int) -> Array:
-        """A statistic of a row, (num_worlds,)."""
-        count = self._count[row]
-        if name == "count":
-            return count.astype(np.float64)
-        low, high, some = self._low[row], self._high[row], np.maximum(count, 1)
-        values = {
-            "rms": np.sqrt(self._sum_of_squares[row] / some),
-            "mean": self._sum[row] / some,
-            "min": low,
-            "max": high,
-            "peak": np.maximum(np.abs(low), np.abs(high)),
-        }[name]
-        return np.where(count > 0, values, np.nan)
+    def values(self) -> Array:
+        """The statistic of every row, (num_rows, num_worlds); nan where there was no sample, but for their number."""
+        if self._name == "count":
+            return self._total.copy()
+        value = self._total / np.maximum(self._count, 1) if self._name in ("rms", "mean") else self._total
+        return np.where(self._count > 0, np.sqrt(value) if self._name == "rms" else value, np.nan)
 
 
 class EpisodeMetrics:
     """The metrics of a task, accumulated step by step in every world."""
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
-        self._metrics = tuple(metrics)
-        rows = sorted({(m.signal, m.over) for m in metrics})
-        self._row_of_metric = [rows.index((m.signal, m.over)) for m in metrics]
-        self._signals = [signal for signal, _ in rows]
-        self._masks = list(dict.fromkeys(over for _, over in rows))
-        self._mask_of_row = np.array([self._masks.index(over) for _, over in rows])
-        self._statistics = RunningStatistics(len(rows), num_worlds)
+        self._names = [metric.name for metric in metrics]
+        by_statistic = {name: [m for m in metrics if m.statistic == name] for name in _FOLDS}
+        self._metrics = {name: own for name, own in by_statistic.items() if own}
+        self._statistics = {name: RunningStatistic(name, len(m), num_worlds) for name, m in self._metrics.items()}
 
     def restart(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds, (num_worlds,) mask."""
-        self._statistics.restart(worlds)
+        for statistic in self._statistics.values():
+            statistic.restart(worlds)
 
     def update(self, signals: Signals, masks: Mapping[str, BoolArray]) -> None:
         """Take steps: the task's signals and the masks by name, (num_steps, num_worlds) each, or (num_worlds,)."""
-        values = np.array([np.atleast_2d(signals[name]) for name in self._signals], dtype=np.float64)
-        sampled = np.array([np.atleast_2d(masks[name]) for name in self._masks])[self._mask_of_row]
-        self._statistics.update(values.swapaxes(0, 1), sampled.swapaxes(0, 1))
+        for name, metrics in self._metrics.items():
+            values = np.array([np.atleast_2d(signals[metric.signal]) for metric in metrics], dtype=np.float64)
+            sampled = np.array([np.atleast_2d(masks[metric.over]) for metric in metrics])
+            self._statistics[name].update(values, sampled)
 
     def values(self) -> dict[str, Array]:
         """Metrics so far, (num_worlds,) each; nan where no step was sampled."""
-        return {
-            metric.name: self._statistics.statistic(metric.statistic, row)
-            for metric, row in zip(self._metrics, self._row_of_metric, strict=True)
+        rows = {
+            metric.name: row
+            for name, metrics in self._metrics.items()
+            for metric, row in zip(metrics, self._statistics[name].values(), strict=True)
         }
+        return {name: rows[name] for name in self._names}

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from elastic_env.metrics import EpisodeMetrics, Metric, RunningStatistics
+from elastic_env.metrics import EpisodeMetrics, Metric, RunningStatistic
 from elastic_env.signals import Array, BoolArray
 
 STATISTICS = {
@@ -41,15 +41,14 @@ def masks(scored: Sequence[bool] | BoolArray) -> dict[str, BoolArray]:
 def test_running_statistics_are_those_of_the_samples(log: tuple[Array, BoolArray]) -> None:
     """Catches a statistic under the wrong name, samples of other worlds, and zero where nothing was sampled."""
     values, sampled = log
-    running = RunningStatistics(1, values.shape[1])
-    for row, mask in zip(values, sampled, strict=True):
-        running.update(row[None, None], mask[None, None])
     for name, function in STATISTICS.items():
-        result = running.statistic(name, 0)
-        for world in range(values.shape[1]):
+        running = RunningStatistic(name, 1, values.shape[1])
+        for row, mask in zip(values, sampled, strict=True):
+            running.update(row[None, None], mask[None, None])
+        for world, result in enumerate(running.values()[0]):
             chosen = values[sampled[:, world], world]
             expected = function(chosen) if len(chosen) or name == "count" else np.nan
-            np.testing.assert_allclose(result[world], expected, rtol=1e-12, atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
 def test_scored_and_all_steps_are_kept_apart() -> None:
@@ -92,11 +91,10 @@ def test_values_do_not_share_memory_with_what_comes_later() -> None:
 def test_how_many_steps_are_taken_at_once_does_not_matter(log: tuple[Array, BoolArray], split: int) -> None:
     """Catches sums that depend on the grouping of steps, and so on when other worlds end: equal to the last bit."""
     values, sampled = log
-    one_by_one, grouped = RunningStatistics(1, values.shape[1]), RunningStatistics(1, values.shape[1])
-    for row, mask in zip(values, sampled, strict=True):
-        one_by_one.update(row[None, None], mask[None, None])
-    for part in (slice(None, split), slice(split, None)):
-        if len(values[part]):
-            grouped.update(values[part, None], sampled[part, None])
     for name in STATISTICS:
-        np.testing.assert_array_equal(grouped.statistic(name, 0), one_by_one.statistic(name, 0))
+        one_by_one, grouped = (RunningStatistic(name, 1, values.shape[1]) for _ in range(2))
+        for row, mask in zip(values, sampled, strict=True):
+            one_by_one.update(row[None, None], mask[None, None])
+        for part in (slice(None, split), slice(split, None)):
+            grouped.update(values[None, part], sampled[None, part])
+        np.testing.assert_array_equal(grouped.values(), one_by_one.values(), err_msg=name)
