@@ -384,6 +384,7 @@ def test_train_command_trains_every_seed_and_resumes(
         assert {row["scenario"] for row in read_progress(Path(f"runs/mine/seed_{seed}"))} == {"nominal"}
     before = (Path("runs/mine/seed_3/last/weights.safetensors")).read_bytes()
     main(["train", "--resume", "runs/mine"])
+    assert "runs/mine is complete" in capsys.readouterr().out
     assert Path("runs/mine/seed_3/last/weights.safetensors").read_bytes() == before
     main(["evaluate", "--policy", "residual:runs/mine/seed_3/last", "--reference", "sine", "--output", "e"])
     with Path("e/episodes.csv").open(newline="") as file:
@@ -409,6 +410,15 @@ def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: st
     """Catches a traceback, or hours of training of something else."""
     with pytest.raises(ConfigurationError, match=message):
         Training(TrainConfig(**{**SMALL, **PPO, **changes}), 0, tmp_path / "x")
+
+
+def test_a_training_that_cannot_begin_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches a run that could be resumed for ever, and numbers that are used up."""
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text(yaml.safe_dump({**SMALL, **PPO, "base": "inptu"}))
+    with pytest.raises(SystemExit):
+        main(["train", "c.yaml"])
+    assert not list(Path("runs").iterdir())
 
 
 def test_a_candidate_that_falls_comes_last(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError
 from train.environments import environment
 from train.progress import read_progress
-from train.runs import new_run
+from train.runs import run_folder
 from train.train_config import CONSTANTS, TrainConfig
 from train.trainer import Trainer
 from train.workers import progress_bar, side_by_side
@@ -28,14 +28,14 @@ def start(config: TrainConfig, console: Console, output: Path | None = None, job
         jobs: Seeds at a time, 0 for one per core; the weights do not depend on it.
 
     Returns:
-        The run's folder.
+        The run's folder; there is none where nothing could begin.
 
     Raises:
         ConfigurationError: Names or options that do not exist.
         ResultsExistError: The output folder holds results.
     """
-    folder = new_run(config.name, config.model_dump(mode="json"), config.seeds[0], output)
-    return _train(config, folder, console, jobs)
+    with run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], output) as folder:
+        return _train(config, folder, console, jobs)
 
 
 def resume(folder: Path, console: Console, jobs: int = 1) -> Path:
@@ -52,7 +52,10 @@ def resume(folder: Path, console: Console, jobs: int = 1) -> Path:
 
 
 def _train(config: TrainConfig, folder: Path, console: Console, jobs: int) -> Path:
-    console.print(f"training in {folder}; if it stops: elastic train --resume {folder}", soft_wrap=True)
+    if all(_is_complete(folder / f"seed_{seed}") for seed in config.seeds):
+        console.print(f"{folder} is complete; to learn for longer, start a new run with --decisions", soft_wrap=True)
+    else:
+        console.print(f"training in {folder}; if it stops: elastic train --resume {folder}", soft_wrap=True)
     with progress_bar(console) as bar:
         tasks = [bar.add_task(f"seed {seed}", total=config.decisions, start=False) for seed in config.seeds]
 
@@ -72,11 +75,16 @@ def _train(config: TrainConfig, folder: Path, console: Console, jobs: int) -> Pa
 def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]) -> None:
     own = folder / f"seed_{seed}"
     report(0)
-    if not (own / "last").is_dir():
+    if not _is_complete(own):
         training = _trainer(config)(config, seed, own, threads)
         report(training.done)
         training.run(report)
     report(config.decisions)
+
+
+def _is_complete(own: Path) -> bool:
+    """Whether a seed's training has come to its end."""
+    return (own / "last").is_dir()
 
 
 def _trainer(config: TrainConfig) -> type[Trainer]:
