@@ -38,6 +38,7 @@ from train.contenders import RawWorlds, VectorLoop
 from train.evaluate import Evaluation, evaluate
 from train.play import play
 from train.runs import new_run, run_folder
+from train.workers import show_progress
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
 MULTISINE = {"kind": "multisine", "amplitude": 0.05, "middle": 0.2, "duration_s": 0.2, "onset_s": 0.3}
@@ -690,6 +691,8 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     names |= {"episodes.csv", "summary.md"}
     assert {path.name for path in Path("runs/demo").iterdir()} == names | {"config.yaml", "metadata.json"}
     assert [name for name in names if f"runs/demo/{name}" not in printed] == []
+    summary = Path("runs/demo/summary.md").read_text()
+    assert [text for text in ("| sine |", "| input_output |") if text not in summary] == []
     of_the_paper = ("Pearson r", "0.9775", "-56.2 to +41.7", "about 40", "below 10")
     policies = ("uncompensated", "input", "dynamic", "oracle", "input_output", "input_wrench", "residual")
     assert [text for text in (*of_the_paper, *policies) if text not in printed] == []
@@ -771,3 +774,14 @@ def test_name_of_a_run_cannot_leave_its_folder(tmp_path: Path) -> None:
     for name in ("../escape", "/tmp/escape", ""):
         with pytest.raises(ConfigurationError, match="name"):
             CompareConfig(name=name)
+
+
+def test_where_there_is_no_terminal_progress_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a log in which long work says nothing until it ends, and one that short work fills."""
+    clock, console = [0.0], Console(file=StringIO())
+    monkeypatch.setattr(time, "monotonic", lambda: clock[-1])
+    with show_progress(console, {"seed 0": 100, "seed 1": 100}) as show:
+        for now, number, done in [(1.0, 0, 50), (11.0, 0, 60), (12.0, 1, 60), (22.0, 1, 61), (40.0, 1, 100)]:
+            clock.append(now)
+            show(number, done)
+    assert console.file.getvalue().split() == ["30", "%", "60", "%", "80", "%"]  # type: ignore[attr-defined]

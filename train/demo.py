@@ -85,7 +85,7 @@ def demo(console: Console, output: Path | None = None) -> None:
             *(file for name in ("pelvis", "zmp") for walk in cells(walks) for file in draw_figure(name, walk, folder)),
             folder / "identification.json",
             write_episodes([*motion, *walks], folder / "episodes.csv"),
-            write_summary(walks, folder / "summary.md"),
+            write_summary([*motion, *walks], folder / "summary.md"),
         ]
     console.print(_testbed_table(result, static), "")
     print_summary(motion, console)

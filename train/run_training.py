@@ -13,7 +13,7 @@ from train.progress import read_progress
 from train.runs import run_folder
 from train.train_config import CONSTANTS, TrainConfig
 from train.trainer import Trainer
-from train.workers import progress_bar, side_by_side
+from train.workers import show_progress, side_by_side
 
 _CONFIG = "config.yaml"
 
@@ -56,12 +56,10 @@ def _train(config: TrainConfig, folder: Path, console: Console, jobs: int) -> Pa
         console.print(f"{folder} is complete; to learn for longer, start a new run with --decisions", soft_wrap=True)
     else:
         console.print(f"training in {folder}; if it stops: elastic train --resume {folder}", soft_wrap=True)
-    with progress_bar(console) as bar:
-        tasks = [bar.add_task(f"seed {seed}", total=config.decisions, start=False) for seed in config.seeds]
+    with show_progress(console, {f"seed {seed}": config.decisions for seed in config.seeds}) as show:
 
         def report(number: int, done: int) -> None:
-            bar.start_task(tasks[number])
-            bar.update(tasks[number], completed=min(done, config.decisions))
+            show(number, min(done, config.decisions))
 
         if jobs == 1:
             for number, seed in enumerate(config.seeds):

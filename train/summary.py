@@ -5,6 +5,7 @@ Scores of an episode that failed are never averaged in; failures are counted bes
 
 import csv
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +115,14 @@ def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """The summary table and its splits as Markdown: medians, and the worst episode in brackets."""
+    """The summary table and its splits as Markdown: medians, and the worst episode in brackets; by environment."""
+    groups = [list(group) for _, group in groupby(evaluations, key=lambda evaluation: evaluation.condition.env)]
+    path.write_text("\n\n".join(part for group in groups for part in _summarised(group)) + "\n")
+    return path
+
+
+def _summarised(evaluations: Sequence[Evaluation]) -> list[str]:
+    """The parts of a summary of one environment."""
     known = evaluations[0].condition.environment
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
     statistic = "Median over the episodes that did not fail" + (" (the worst of them in brackets)" if several else "")
@@ -125,8 +133,7 @@ def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
     notes = failure_notes(evaluations)
     if notes:
         parts += ["Where all episodes failed:", "\n".join(f"* {note}" for note in notes)]
-    path.write_text("\n\n".join(parts) + "\n")
-    return path
+    return parts
 
 
 def _markdown(evaluations: Sequence[Evaluation], columns: Sequence[Column]) -> str:

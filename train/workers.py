@@ -5,7 +5,8 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -17,6 +18,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from train.conditions import Condition
 from train.evaluate import Evaluation, evaluate, num_steps
+
+_LEAST_S = 10.0
+"""Time between two lines of progress in a log [s]; shorter work says nothing."""
 
 
 def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
@@ -31,15 +35,16 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
         ]
     steps = [num_steps(condition) for condition in conditions]
     longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
-    with progress_bar(console, transient=True) as bar:
-        task = bar.add_task("control steps", total=sum(steps))
-        results = side_by_side(
-            _evaluate,
-            [(conditions[number],) for number in longest_first],
-            jobs,
-            lambda _, advance: bar.advance(task, advance),
-        )
-        bar.update(task, completed=sum(steps))
+    done = 0
+    with show_progress(console, {"control steps": sum(steps)}, transient=True) as show:
+
+        def advance(_: int, played: int) -> None:
+            nonlocal done
+            done += played
+            show(0, done)
+
+        results = side_by_side(_evaluate, [(conditions[number],) for number in longest_first], jobs, advance)
+        show(0, sum(steps))
     return [results[longest_first.index(number)] for number in range(len(conditions))]
 
 
@@ -47,12 +52,12 @@ def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluati
     total, done, say = num_steps(condition), 0, plain_progress(console)
     console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True)
 
-    def progress(steps: int) -> None:
+    def advance(steps: int) -> None:
         nonlocal done
         done += steps
         say(done / total)
 
-    return evaluate(condition, progress)
+    return evaluate(condition, advance)
 
 
 def side_by_side(
@@ -95,28 +100,58 @@ def side_by_side(
     return results
 
 
-def plain_progress(console: Console) -> Callable[[float], None]:
+def plain_progress(console: Console, least_s: float = 0.0) -> Callable[[float], None]:
     """A function that takes the share of the work that is done, and says each tenth of it in a line.
 
-    For work beside a control loop: the thread of a `progress_bar` would take time from it.
-    """
-    said = 0
+    For work beside a control loop, from which the thread of a bar would take time, and for logs.
 
-    def progress(share: float) -> None:
-        nonlocal said
-        if int(10 * share) > said:
-            said = int(10 * share)
+    Args:
+        console: Where it says so.
+        least_s: Shortest time between two lines, and before the first one [s].
+    """
+    said, when = 0, time.monotonic()
+
+    def say(share: float) -> None:
+        nonlocal said, when
+        if int(10 * share) > said and time.monotonic() - when >= least_s:
+            said, when = int(10 * share), time.monotonic()
             console.print(f"  {10 * said} %")
 
-    return progress
+    return say
 
 
-def progress_bar(console: Console, transient: bool = False) -> Progress:
-    """Progress of something that is counted, with times."""
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-        console=console, transient=transient,
-    )  # fmt: skip
+@contextmanager
+def show_progress(
+    console: Console, totals: Mapping[str, int], transient: bool = False
+) -> Iterator[Callable[[int, int], None]]:
+    """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there is none.
+
+    Args:
+        console: Where it is shown.
+        totals: What is to be done of every task, by its name.
+        transient: Whether the bars vanish at the end.
+
+    Yields:
+        A function that takes the number of a task and how much of it has been done.
+    """
+    if not console.is_terminal:
+        say, done = plain_progress(console, _LEAST_S), [0] * len(totals)
+
+        def count(number: int, amount: int) -> None:
+            done[number] = amount
+            say(sum(done) / sum(totals.values()))
+
+        yield count
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=transient) as bar:
+        tasks = [bar.add_task(name, total=total, start=False) for name, total in totals.items()]
+
+        def draw(number: int, amount: int) -> None:
+            bar.start_task(tasks[number])
+            bar.update(tasks[number], completed=amount)
+
+        yield draw
 
 
 @contextmanager
