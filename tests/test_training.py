@@ -22,6 +22,7 @@ import baselines
 from baselines.residual import load_residual
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
+from train.bench import BenchCase
 from train.cli import main
 from train.constant_search import ConstantSearch
 from train.evaluate import evaluate, make_vector_env
@@ -410,6 +411,16 @@ def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: st
     """Catches a traceback, or hours of training of something else."""
     with pytest.raises(ConfigurationError, match=message):
         Training(TrainConfig(**{**SMALL, **PPO, **changes}), 0, tmp_path / "x")
+
+
+def test_a_motion_that_is_left_out_stays_the_default() -> None:
+    """Catches a configuration that is refused when one of its values is replaced, or when it is read back."""
+    for config in (
+        TrainConfig(env="testbed"),
+        BenchCase(env="testbed", policy="input", figures={"link_max_rad": None}),
+    ):
+        assert config.replace(env="walker").reference is None
+        assert type(config).model_validate(config.model_dump(mode="json")) == config
 
 
 def test_a_training_that_cannot_begin_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ class BenchCase(Model):
     policy: str
     """A baseline, residual:PATH, or "module:function"."""
     scenario: str = "nominal"
-    reference: Motion = None
+    reference: Motion | None = None
     """Motion, as in a comparison; None for the environment's default."""
     seed: int = 0
     figures: dict[str, float | None] = Field(min_length=1)

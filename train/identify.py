@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 from pydantic import model_validator
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
@@ -20,7 +19,7 @@ from elastic_env.robots.testbed import Pendulum
 from train import plots
 from train.runs import run_folder
 from train.testbed_plots import draw_identification
-from train.workers import plain_progress
+from train.workers import plain_progress, show_progress
 
 
 class IdentifyConfig(Model):
@@ -102,10 +101,8 @@ def _progress(config: IdentifyConfig, console: Console) -> Iterator[Callable[[fl
         console.print(f"{work} at {config.hardware['port']}", soft_wrap=True)
         yield plain_progress(console)
         return
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(work, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+    with show_progress(console, {f"{work}, in %": 100}, transient=True) as show:
+        yield lambda share: show(0, round(100 * share))
 
 
 def result_table(result: Identification) -> Table:

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 from pydantic import Field
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from elastic_env.config import Model, quantity
@@ -27,6 +26,7 @@ from train.contenders import (
     VectorLoop,
 )
 from train.runs import run_folder
+from train.workers import plain_progress
 
 _PPO_PROCESSES = 2
 
@@ -82,12 +82,12 @@ class _Entry:
     against: int
 
 
-def measure(config: SpeedConfig, progress: Callable[[], None] | None = None) -> list[SpeedResult]:
+def measure(config: SpeedConfig, progress: Callable[[float], None] | None = None) -> list[SpeedResult]:
     """Time all contenders in turn, round by round; the first round warms up.
 
     Args:
         config: What to measure.
-        progress: Called after every contender of every round.
+        progress: Called after every contender of every round with the share of the work that is done.
 
     Raises:
         ConfigurationError: Environment or policy does not exist.
@@ -95,11 +95,11 @@ def measure(config: SpeedConfig, progress: Callable[[], None] | None = None) -> 
     entries = _entries(config)
     try:
         rates: list[list[float]] = [[] for _ in entries]
-        for _ in range(config.rounds + 1):
-            for entry, found in zip(entries, rates, strict=True):
-                found.append(entry.contender.run(config.steps))
-                if progress is not None:
-                    progress()
+        turns = [*zip(entries, rates, strict=True)] * (config.rounds + 1)
+        for done, (entry, found) in enumerate(turns, 1):
+            found.append(entry.contender.run(config.steps))
+            if progress is not None:
+                progress(done / len(turns))
     finally:
         for entry in entries:
             entry.contender.close()
@@ -186,9 +186,8 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
     """
     VectorLoop(config.env, 1, 1, config.policy)
     with run_folder("speed", config.model_dump(mode="json"), None, output) as folder:
-        with Progress(console=console, transient=True) as bar:
-            task = bar.add_task("measuring", total=None)
-            results = measure(config, lambda: bar.advance(task))
+        console.print("measuring every contender in turn, round by round")
+        results = measure(config, plain_progress(console))
         path = folder / "speed.json"
         path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
         if with_profile:

@@ -28,7 +28,7 @@ class TrainConfig(Model):
 
     name: str = "train"
     env: str = "walker"
-    reference: Motion = None
+    reference: Motion | None = None
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: list[str] = Field(default=["nominal"], min_length=1)
     """Scenarios whose worlds are learned from together, in equal shares."""
@@ -37,7 +37,7 @@ class TrainConfig(Model):
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
     base: str = "input_output"
-    """Policy that is corrected."""
+    """Policy that is corrected: a baseline by name, since an exported residual plays without code of its own."""
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     """How the residual acts and what it sees."""

@@ -103,7 +103,7 @@ def side_by_side(
 def plain_progress(console: Console, least_s: float = 0.0) -> Callable[[float], None]:
     """A function that takes the share of the work that is done, and says each tenth of it in a line.
 
-    For work beside a control loop, from which the thread of a bar would take time, and for logs.
+    For work beside a control loop and work that is timed, from which the thread of a bar would take time, and for logs.
 
     Args:
         console: Where it says so.
