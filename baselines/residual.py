@@ -249,7 +249,9 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     try:
         tensors = load_file(folder / WEIGHTS)
     except (OSError, SafetensorError) as error:
-        raise ConfigurationError(f"{folder / WEIGHTS} cannot be read: {error}") from None
+        raise ConfigurationError(
+            f"{folder / WEIGHTS} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
+        ) from None
     return description, Network(description, tensors)
 
 

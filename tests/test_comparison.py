@@ -200,9 +200,18 @@ def test_a_base_is_the_policy_with_the_same_options() -> None:
     assert given_anew.options == {"stiffness_scale": 0.5}
 
 
+def test_shipped_policies_are_a_family_wherever_one_works() -> None:
+    """Catches a comparison of what is shipped that runs in the project's own folder alone, and one's own overruled."""
+    members = [entrant.member for entrant in expand([PolicySpec(name="residual:testbed/seed_*")])[1:]]
+    assert [member.folder for member in members if member] == [f"testbed/seed_{seed}" for seed in range(5)]
+    describe(Path("testbed/seed_7"), 7)
+    assert [e.member.training_seed for e in expand([PolicySpec(name="residual:testbed/seed_*")])[1:] if e.member] == [7]
+
+
 def test_folders_that_are_no_family_are_refused() -> None:
     """Catches an interval over things that are not training seeds of one configuration."""
-    with pytest.raises(ConfigurationError, match=r"no folder matches 'run/seed_\*/last'"):
+    Path("rnu/other").mkdir(parents=True)
+    with pytest.raises(ConfigurationError, match=r"no folder matches 'run/seed_\*/last'; this folder has rnu"):
         expand([FAMILY])
     describe(Path("run/seed_1/last"), 1)
     describe(Path("run/seed_2/last"), 1)

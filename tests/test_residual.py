@@ -513,5 +513,5 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
             baselines.make(f"residual:{path}", env)
     path = folder(tmp_path / "s")
     (path / "weights.safetensors").write_bytes(b"\x80\x04pickle")
-    with pytest.raises(ConfigurationError, match="cannot be read"):
+    with pytest.raises(ConfigurationError, match="cannot be read: it is missing, cut"):
         baselines.make(f"residual:{path}", env)

@@ -286,6 +286,7 @@ def test_the_table_fits_its_terminal(width: int) -> None:
     assert row[:4] == ["0.8+0.6+0.8", "s", "ideal+soft", "uncompensated"]
     assert set(row[4:-1]) <= {"87.60", "87.6", "88"}
     assert any("summary.md" in line for line in lines) == (width < 100)
+    assert any("Eq. 1" in line for line in lines) == (width == 100)  # the legend is of what is shown
 
 
 # Figures.

@@ -29,12 +29,14 @@ class Column:
         metric: Name in the record of an episode; its end is the unit.
         on_console: Whether it is shown where there is little room.
         decimals: How many are shown.
+        note: What the title leaves open, for the legend; empty where it says it all.
     """
 
     title: str
     metric: str
     on_console: bool = True
     decimals: int = 2
+    note: str = ""
 
     @property
     def unit(self) -> str:
@@ -96,7 +98,7 @@ class Environment:
         columns: The summary table.
         splits: Further tables of the summary, title and columns.
         subject: What the summary table is about.
-        note: What its reader has to know.
+        note: What its reader has to know beside the legend of the columns.
         figures: Names of the time series to draw, see `train.figures`.
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
@@ -119,7 +121,6 @@ class Environment:
     traced: tuple[str, ...]
     columns: tuple[Column, ...]
     subject: str
-    note: str
     figures: tuple[str, ...]
     overview: Column
     swept: tuple[Column, ...]
@@ -128,6 +129,7 @@ class Environment:
     also: tuple[Column, ...] = ()
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     learned_from: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
     quantity: str = ""
     failure: str = "fail"
     is_real: bool = False
@@ -216,12 +218,11 @@ _TESTBED = Environment(
     columns=(
         Column("rms", "link_error_rms_rad"),
         Column("peak", "link_error_peak_rad"),
-        Column("IMU-", "link_error_imu_min_rad"),
-        Column("IMU+", "link_error_imu_max_rad"),
-        Column("est.", "link_estimate_error_rms_rad"),
+        Column("IMU-", "link_error_imu_min_rad", note="least error by the link's IMU"),
+        Column("IMU+", "link_error_imu_max_rad", note="greatest error by it"),
+        Column("est.", "link_estimate_error_rms_rad", note="rms error of the estimated link angle"),
     ),
     subject="link error",
-    note="IMU- and IMU+: range by the link's IMU; est.: rms error of the estimated link angle.",
     figures=("time", "static"),
     overview=Column("link error rms", "link_error_rms_rad"),
     swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
@@ -254,8 +255,8 @@ _WALKER = Environment(
         _ZMP,
         Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
         Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
-        Column("early", "early_touchdown_mean_s", decimals=0),
-        Column("e mean", "frame_error_mean_m", decimals=1),
+        Column("early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"),
+        Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
         Column("COM jump", "com_jump_mean_m", decimals=1),
     ),
     splits=(
@@ -271,7 +272,6 @@ _WALKER = Environment(
         ),
     ),
     subject="pelvis and ZMP of the walk",
-    note="Early: swing foot down before its time; e: Eq. 1 at the support changes.",
     figures=("pelvis", "zmp"),
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
     swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
@@ -293,7 +293,7 @@ _HARDWARE = replace(
     columns=tuple(column for column in _TESTBED.columns if column.title != "est."),
     traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
     subject="link error by the IMU",
-    note="On hardware: IMU- and IMU+ are the range; there is no truth to score an estimate by.",
+    note="On hardware there is no truth to score an estimate by.",
     is_real=True,
 )
 

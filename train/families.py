@@ -1,16 +1,20 @@
 """Policies of a comparison with all training seeds of a residual, and with the base that each residual belongs to."""
 
+import difflib
+import fnmatch
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from baselines.policies import RESIDUAL
-from baselines.residual import ResidualDescription, read_description
+from baselines.residual import ResidualDescription, read_description, shipped
 from elastic_env.errors import ConfigurationError
 from train.conditions import Member, PolicySpec
 
 _WILD = re.compile(r"[*?\[]")
+_NEAREST = 5
+"""Names that the error for a pattern without folders lists."""
 _SEED = re.compile(r"seed[_-]?(\d+)")
 
 
@@ -105,22 +109,32 @@ def origin(members: Sequence[Member]) -> Origin:
 
 
 def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]:
-    """Folders of a pattern in natural order, with training seed and description."""
+    """Folders of a pattern in natural order, with training seed and description; shipped ones where none lie there."""
     if not _WILD.search(pattern):
         folder = Path(pattern)
         description = read_description(folder)
         return [(folder, _training_seed(folder, description), description)]
     anchor = Path(pattern).anchor
-    found = Path(anchor).glob(str(Path(pattern).relative_to(anchor)))
-    folders = sorted((path for path in found if path.is_dir()), key=_natural)
+    found = [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
+    folders = sorted(found or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
     if not folders:
-        raise ConfigurationError(f"no folder matches {pattern!r}; a * stands for what training seeds differ in")
+        raise ConfigurationError(f"no folder matches {pattern!r}; {_nearest(Path(pattern))}")
     members = []
     for folder in folders:
         description = read_description(folder)
         members.append((folder, _training_seed(folder, description), description))
     _require_one_family(pattern, members)
     return members
+
+
+def _nearest(pattern: Path) -> str:
+    """What lies where the folders of a pattern end to exist, the most similar names first, and what is shipped."""
+    there = next(path for path in pattern.parents if path.is_dir() and not _WILD.search(str(path)))
+    names = [path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    near = difflib.get_close_matches(pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0)
+    families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped())
+    where = "this folder" if there == Path() else str(there)
+    return f"{where} has {', '.join(near) or 'no folders'}; with the package come {', '.join(families)}"
 
 
 def _training_seed(folder: Path, description: ResidualDescription) -> int | None:

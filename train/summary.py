@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from train.environments import Column
+from train.environments import Column, Environment
 from train.evaluate import Evaluation
 
 _ANY_WIDTH = 10_000
@@ -44,7 +44,7 @@ def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column] |
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console] if columns is None else columns
     title = f"{known.subject}, median over episodes"
-    table = Table(title=title, caption=escape(known.note), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=title, caption=escape(_legend(known, columns)), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     swept = _swept(evaluations)
     for name in ("reference", "scenario", "policy"):
         table.add_column(name, no_wrap=True, vertical="bottom")
@@ -127,7 +127,7 @@ def _summarised(evaluations: Sequence[Evaluation]) -> list[str]:
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
     statistic = "Median over the episodes that did not fail" + (" (the worst of them in brackets)" if several else "")
     head = f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; failures are counted beside."
-    parts = [head, known.note, _markdown(evaluations, known.columns)]
+    parts = [head, _legend(known, known.columns), _markdown(evaluations, known.columns)]
     for title, columns in known.splits:
         parts += [f"{title}:", _markdown(evaluations, columns)]
     notes = failure_notes(evaluations)
@@ -147,6 +147,12 @@ def _markdown(evaluations: Sequence[Evaluation], columns: Sequence[Column]) -> s
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _legend(known: Environment, columns: Sequence[Column]) -> str:
+    """What the titles of the columns that are shown leave open."""
+    notes = "; ".join(f"{column.title}: {column.note}" for column in columns if column.note)
+    return " ".join(sentence for sentence in (notes and f"{notes}.", known.note) if sentence)
 
 
 def _swept(evaluations: Sequence[Evaluation]) -> list[str]:
