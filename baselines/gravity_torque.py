@@ -1,7 +1,7 @@
 """Gravity torque of the assumed rigid model: what the compensators turn into a deflection.
 
-`gravity_torque(q)` and its gradient on (..., n) joint angles, from Pinocchio (the reference, row by row) or from
-NumPy for a whole batch at once. Both agree to rounding.
+`gravity_torque(q)` and its gradient on (..., n) joint angles, from Pinocchio (the reference, row by row) or for a whole
+batch at once: in closed form for one hinge, from NumPy for a tree of them. All agree to rounding.
 """
 
 from typing import Any, Literal, Protocol, get_args
@@ -15,9 +15,9 @@ from elastic_env.rigid_body import RigidBody, require_hinge_tree
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.signals import Array
 
-GravityMethod = Literal["pinocchio", "batched", "com", "ankle", "lumped"]
+GravityMethod = Literal["hinge", "pinocchio", "batched", "com", "ankle", "lumped"]
 
-_FIXED_METHODS = ("pinocchio", "batched")
+_FIXED_METHODS = ("hinge", "pinocchio", "batched")
 
 
 class GravityModel(Protocol):
@@ -47,7 +47,8 @@ class FixedDynamics:
     """Inverse dynamics of a robot on a fixed base."""
 
     def __init__(self, model: RobotModel) -> None:
-        self.inverse_dynamics = RigidBody(model.rigid, model.joint_names).inverse_dynamics
+        body = HingeTorque(model) if len(model.joint_names) == 1 else RigidBody(model.rigid, model.joint_names)
+        self.inverse_dynamics = body.inverse_dynamics
 
     def at(self, rows: Array) -> "FixedDynamics":  # noqa: ARG002  a walker's
         """Itself."""
@@ -57,8 +58,9 @@ class FixedDynamics:
 def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
     """The gravity torque of a robot model by a chosen method; a `GravityModel` after `at(observations)`.
 
-    A robot on a fixed base has "pinocchio" (default) and "batched", and is a `GravityModel` at once; a walker has the
-    methods of `baselines.contact_torque`: "com" (default), "ankle" and "lumped".
+    A robot on a fixed base has "hinge" (default for one joint), "pinocchio" (default for several) and "batched", and is
+    a `GravityModel` at once; a walker has the methods of `baselines.contact_torque`: "com" (default), "ankle" and
+    "lumped".
 
     Raises:
         ConfigurationError: The method does not exist, or not for this robot.
@@ -69,7 +71,11 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         if method == "com" or method == "ankle" or method == "lumped":
             return ContactGravity(model, method)
         raise unknown_name("gravity method of a walker", method, get_args(ContactMethod))
-    if method in (None, "pinocchio"):
+    if method is None:
+        method = "hinge" if len(model.joint_names) == 1 else "pinocchio"
+    if method == "hinge":
+        return FixedGravity(HingeTorque(model))
+    if method == "pinocchio":
         return FixedGravity(RigidBody(model.rigid, model.joint_names))
     if method == "batched":
         return FixedGravity(BatchedGravity(model))
@@ -92,6 +98,39 @@ def make_load(model: RobotModel, output: str, gravity: Any) -> Any:
 def make_dynamics(model: RobotModel, gravity: Any) -> Any:
     """Inverse dynamics of a robot model: of any motion on a fixed base, of the planned one for a walker."""
     return PlannedTorque(model, gravity) if isinstance(model, WalkerModel) else FixedDynamics(model)
+
+
+class HingeTorque:
+    r"""Torque of a robot with one hinge in closed form, from what Pinocchio says of three states.
+
+    .. math:: \tau = I \ddot q + a \cos q + b \sin q
+
+    Args:
+        model: Robot with one joint, about which its inertia I is always the same.
+
+    Raises:
+        ConfigurationError: It has more joints.
+    """
+
+    def __init__(self, model: RobotModel) -> None:
+        names = model.joint_names
+        if len(names) != 1:
+            raise ConfigurationError(f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)}")
+        body, zero = RigidBody(model.rigid, names), np.zeros(1)
+        self._a, self._b = body.gravity_torque(zero), body.gravity_torque(zero + np.pi / 2)
+        self._inertia = body.inverse_dynamics(zero, zero, np.ones(1)) - self._a
+
+    def gravity_torque(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        return self._a * np.cos(q) + self._b * np.sin(q)
+
+    def gravity_gradient(self, q: Array) -> Array:
+        """See `GravityModel`."""
+        return (self._b * np.cos(q) - self._a * np.sin(q))[..., None]
+
+    def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  as of a `RigidBody`
+        """Torque of a motion without friction, from (..., 1) [rad], [rad/s], [rad/s²] to (..., 1) [N·m]."""
+        return self._inertia * q_ddot + self.gravity_torque(q)
 
 
 class BatchedGravity:

@@ -1,10 +1,13 @@
-"""The batched gravity torque against Pinocchio, MuJoCo, finite differences and the closed form of the pendulum."""
+"""Gravity torques against Pinocchio, MuJoCo, finite differences and the closed form of the pendulum."""
+
+import re
 
 import numpy as np
 import pytest
 
-from baselines.gravity_torque import BatchedGravity, GravityModel, make_gravity
+from baselines.gravity_torque import BatchedGravity, GravityModel, HingeTorque, make_gravity
 from elastic_env.errors import ConfigurationError
+from elastic_env.rigid_body import RigidBody
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array
 from tests.trees import ORDER, TREE, bias_of_mujoco, pendulum, robot, tree
@@ -53,6 +56,31 @@ def test_gradient_is_the_derivative_of_the_torque(model: RobotModel, method: str
         np.testing.assert_allclose(gravity.gravity_gradient(q), central_differences(gravity, q), rtol=0.0, atol=2e-8)
 
 
+@pytest.mark.parametrize("name", ORDER)
+def test_one_hinge_has_the_closed_form_that_pinocchio_says(name: str) -> None:
+    """Catches a, b and I of another axis, anchor or reference: each hinge of the tree in turn, the rest rigid."""
+    model = robot(re.sub(rf'<joint name="(?!{name}")[^>]*/>', "", TREE), [name])
+    hinge, body = HingeTorque(model), RigidBody(model.rigid, [name])
+    q, q_dot, q_ddot = np.random.default_rng(3).uniform(-4.0, 4.0, (3, 50, 1))
+    for mine, reference in (
+        (hinge.gravity_torque(q), body.gravity_torque(q)),
+        (hinge.gravity_gradient(q), body.gravity_gradient(q)),
+        (hinge.inverse_dynamics(q, q_dot, q_ddot), body.inverse_dynamics(q, q_dot, q_ddot)),
+    ):
+        assert np.abs(reference).max() > 0.01
+        np.testing.assert_allclose(mine, reference, rtol=0.0, atol=1e-12)
+
+
+def test_the_closed_form_is_of_one_hinge() -> None:
+    """Catches the torque of a tree taken for that of its first joint; what nobody chose suits the robot."""
+    with pytest.raises(ConfigurationError, match="'hinge' needs one joint, got 6: knee, yaw"):
+        make_gravity(tree(), "hinge")
+    for model, method in ((tree(), "pinocchio"), (pendulum(), "hinge")):
+        q = postures(model, 3)
+        chosen, named = make_gravity(model), make_gravity(model, method)
+        np.testing.assert_array_equal(chosen.gravity_torque(q), named.gravity_torque(q))
+
+
 def test_joints_on_different_branches_do_not_feel_each_other() -> None:
     """Catches a gradient that couples arm and leg, which no joint of both carries."""
     gradient = BatchedGravity(tree()).gravity_gradient(postures(tree(), 50))
@@ -62,7 +90,7 @@ def test_joints_on_different_branches_do_not_feel_each_other() -> None:
     assert np.abs(gradient[:, elbow, ORDER.index("yaw")]).max() > 0.1  # the trunk does carry the arm
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["hinge", *METHODS])
 def test_pendulum_follows_its_closed_form(method: str) -> None:
     """Catches a cosine for the sine, and q that grows to the wrong side: τ_g = 60 sin q, its gradient 60 cos q."""
     gravity, q = make_gravity(pendulum(), method), np.linspace(-3.0, 3.0, 61)[:, None]
@@ -97,7 +125,7 @@ def test_gravity_leaves_its_argument_alone(model: RobotModel, method: str) -> No
 
 def test_unknown_method_names_itself_and_the_choices() -> None:
     """Catches a silent fallback, and a message that does not help."""
-    with pytest.raises(ConfigurationError, match=r"unknown gravity method 'symbolic'.*pinocchio, batched"):
+    with pytest.raises(ConfigurationError, match=r"unknown gravity method 'symbolic'.*hinge, pinocchio, batched"):
         make_gravity(pendulum(), "symbolic")
 
 
