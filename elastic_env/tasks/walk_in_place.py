@@ -85,6 +85,7 @@ from elastic_env.tasks.walk_state import (
     WalkState,
     WalkTruth,
     attitude_of,
+    highest,
     rms,
     rotation_of,
 )
@@ -149,8 +150,10 @@ class WalkTask:
         """Control steps of an episode."""
         self._count(np.zeros(n, dtype=np.int64))
         self._reference, self._phases = _reference_rows(self.plan), _phase_rows(self.plan)
+        self._counts = np.where(self._phases[0], 1.0, config.reward.standing)
         self._half_of_swing, self._swing_foot = _halves_of_swing(self.plan), RIGHT - self.plan.timing.support
-        self._reference.flags.writeable = self._phases.flags.writeable = False
+        for table in (self._reference, self._phases, self._counts):
+            table.flags.writeable = False
         self._draw = np.zeros(n, dtype=np.int64)
         self._stiffness, self._damping = np.tile(self._true_model.stiffness, (n, 1)), self._true_model.damping
         self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
@@ -197,7 +200,7 @@ class WalkTask:
     def command(self, offset: Array) -> Array:
         """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
         self._offset_before, self._offset = self._offset, offset.copy()
-        self._command = self.plan.q[self._next] + offset
+        self._command = self.plan.q.take(self._next, axis=0) + offset
         return self._command - self._encoder_bias
 
     def disturb(self, simulation: Simulation) -> None:
@@ -224,7 +227,7 @@ class WalkTask:
         observation[:, 0:12] = shown.encoder
         observation[:, 12:24] = (shown.encoder - shown.encoder_before) / self.config.control_period_s
         observation[:, 24:41] = shown.body
-        observation[:, 41:83] = self._reference[self._next]
+        observation[:, 41:83] = self._reference.take(self._next, axis=0)
         observation[:, 83:95] = self._command
         return observation
 
@@ -257,10 +260,10 @@ class WalkTask:
             "zmp_deviation_x": deviation[:, 0],
             "zmp_deviation_y": deviation[:, 1],
             "link_error": rms(error),
-            "link_error_lowest": error.min(axis=1),
-            "link_error_highest": error.max(axis=1),
+            "link_error_lowest": -highest(-error),
+            "link_error_highest": highest(error),
             "deflection": rms(deflection),
-            "joint_torque": np.abs(torque).max(axis=1),
+            "joint_torque": highest(np.abs(torque)),
             "servo_torque": rms(state.servo_torque),
             "command_rate": self._command_rate(sample),
             "force_left": state.force[:, LEFT].copy(),
@@ -287,7 +290,7 @@ class WalkTask:
         """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
         weights, state = self.config.reward, sample.state
         deviation = state.zmp - self.plan.zmp.take(self._now, axis=0)
-        counts = np.where(self._phases[0].take(self._now), 1.0, weights.standing)
+        counts = self._counts.take(self._now)
         return {
             "tilt": weights.tilt * counts * tilt_penalty(state.attitude[:, 2]),
             "zmp": weights.zmp * counts * zmp_penalty(np.hypot(deviation[:, 0], deviation[:, 1])),
@@ -349,22 +352,15 @@ class WalkTask:
     def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
         """The true state of some worlds; the others keep their last one."""
         # take, not an index: the memory order of its result does not depend on the number of worlds
-        position, velocity = (
-            simulation.qpos.take(self._positions, axis=1),
-            simulation.qvel.take(self._velocities, axis=1),
-        )
-        m = len(LEG_JOINTS)
-        pelvis, quaternion = position[:, 2 * m : 2 * m + 3], position[:, 2 * m + 3 :]
+        position = simulation.qpos.take(self._positions, axis=1)
         wrench = -simulation.bind("sensordata")  # MuJoCo's act on the foot, ours on the leg
         foot_R = simulation.bind("site_xmat").take(self._sites, axis=1).reshape(-1, 2, 3, 3)
         ankles = simulation.bind("site_xpos").take(self._sites, axis=1)
         force, moment = self._foot_sensors.ground_wrench(wrench.reshape(-1, 2, 2, 3), foot_R)
         fresh = WalkState(
-            theta=position[:, :m], theta_dot=velocity[:, :m],
-            q=position[:, m : 2 * m], q_dot=velocity[:, m : 2 * m],
-            pelvis=pelvis, quaternion=quaternion,
-            attitude=attitude_of(quaternion),
-            rate=velocity[:, 2 * m :],
+            position=position,
+            velocity=simulation.qvel.take(self._velocities, axis=1),
+            attitude=attitude_of(position[:, -4:]),
             ankles=ankles,
             wrench=wrench,
             force=force[..., 2],
