@@ -43,13 +43,19 @@ class Scenario(Model):
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
 
     @property
-    def is_random(self) -> bool:
-        """Whether episodes of the same motion differ: robots, pushes and slopes that are drawn, noise."""
+    def draws_robots(self) -> bool:
+        """Whether episodes of the same motion differ in more than noise: joints, offsets of sensors, push or slope."""
         drawn = (
-            self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.gyro_noise_rad_s,
-            self.force_noise_n, self.moment_noise_nm,
+            self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.imu.bias_spread_rad,
+            self.pelvis_imu.bias_spread_rad,
         )  # fmt: skip
-        return any(value > 0.0 for value in drawn) or self.imu.is_random or self.pelvis_imu.is_random
+        return any(value > 0.0 for value in drawn)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether episodes of the same motion differ: in what `draws_robots` says, or by noise."""
+        noise = self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm
+        return self.draws_robots or any((*noise, self.imu.is_random, self.pelvis_imu.is_random))
 
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)

@@ -21,15 +21,17 @@ import train.compare
 from baselines.residual import ResidualDescription, read_description
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError, MissingExtraError
-from train.changes import CEILING, Change, changes, level, merged, percent_interval
+from train.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
 from train.changes_tables import changes_table, write_statistics
 from train.cli import main
 from train.compare import CompareConfig
 from train.conditions import Condition, Member, PolicySpec
 from train.evaluate import Evaluation, evaluate
 from train.families import expand
+from train.figures import has_swept_references
 from train.progress import learning_curves
 from train.report import Results, require_plotly, write_report
+from train.report.page import changes_html
 from train.runs import run_folder
 from train.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
 
@@ -208,6 +210,54 @@ def test_shipped_policies_are_a_family_wherever_one_works() -> None:
     assert [e.member.training_seed for e in expand([PolicySpec(name="residual:testbed/seed_*")])[1:] if e.member] == [7]
 
 
+def test_a_residual_that_is_called_like_its_base_is_not_taken_for_it() -> None:
+    """Catches both under one title, whose episodes would then be averaged together."""
+    describe(Path("one"), 1)
+    titles = [entrant.policy.title for entrant in expand([PolicySpec(name="residual:one", label="input_output")])]
+    assert titles == ["input_output (base of input_output)", "input_output"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scenarios": ["nominal", "soft", "nominal"]}, "the scenario 'nominal' stands twice"),
+        ({"references": [3, 1.6, {"step_period": 3.0}]}, "the reference '3 s' stands twice"),
+        ({"sweep": {"option": "stiffness_scale", "values": [1, 1]}}, "the value of the sweep 1.0 stands twice"),
+        (
+            {
+                "sweep": {"option": "stiffness_scale", "values": [1, 2]},
+                "policies": [{"name": "input", "level": True}],
+            },
+            "a sweep needs a policy that it varies",
+        ),
+    ],
+)
+def test_what_would_count_double_is_refused(changes: dict[str, Any], message: str) -> None:
+    """Catches an interval that gets narrower by naming a scenario twice."""
+    with pytest.raises(ConfigurationError, match=message):
+        CompareConfig(**{"name": "x", "env": "walker", "references": [3], "policies": ["input"], **changes})
+
+
+def test_references_of_one_number_are_no_sweep() -> None:
+    """Catches two walks of the same step period taken for one point of a curve."""
+    walks: list[Any] = [3, 1.6, 1.1, {"step_period": 3, "num_steps": 2}]
+    cells = [cell("base", {"all": [1.0]}, "soft", reference=reference) for reference in walks]
+    assert has_swept_references(cells[:3])
+    assert not has_swept_references(cells)
+
+
+def test_a_group_without_a_pair_in_one_of_its_scenarios_has_no_figures() -> None:
+    """Catches means and probabilities of a pooled row that are of other scenarios than it says."""
+    fallen, fine = [[None, None]] * 5, [[1.0, 1.0]] * 5
+    base = [cell("base", {"all": [2.0, 2.0]}, scenario) for scenario in ("ideal", "soft")]
+    learned = [*family(fine, "ideal"), *family(fallen, "soft")]
+    rows = changes([*base, *learned], {"both": ["ideal", "soft"]})
+    pooled = next(row for row in rows if row.is_group)
+    assert not np.isfinite([pooled.relative.value, pooled.improvement.value, pooled.mine]).any()
+    assert pooled.sentence.startswith("nothing to compare: in one of the scenarios did not both stay up to the end")
+    assert "nan" not in changes_html([pooled], {"learned": "red"}, [])
+
+
 def test_folders_that_are_no_family_are_refused() -> None:
     """Catches an interval over things that are not training seeds of one configuration."""
     Path("rnu/other").mkdir(parents=True)
@@ -220,6 +270,10 @@ def test_folders_that_are_no_family_are_refused() -> None:
     shutil.rmtree("run/seed_2")
     describe(Path("run/seed_2/last"), 2, base="input")
     with pytest.raises(ConfigurationError, match="base of run/seed_2/last is 'input' and of run/seed_1/last 'input_o"):
+        expand([FAMILY])
+    shutil.rmtree("run/seed_2")
+    describe(Path("run/seed_2/last"), 2, config={"decisions": 10})
+    with pytest.raises(ConfigurationError, match=r"the trained decisions of run/seed_2/last is 10 and of .* None"):
         expand([FAMILY])
     shutil.rmtree("run/seed_2")
     Path("run/seed_2/last").mkdir(parents=True)
@@ -289,14 +343,21 @@ def test_change_of_a_family_is_paired_per_training_seed() -> None:
 
 
 SENTENCES: dict[str, tuple[Sequence[Sequence[float | None]], str]] = {
-    "lower": ([[1.0, 1.0], [1.2, 1.0], [1.0, 1.2]], "47 % lower; fewer falls than base"),
-    "higher": ([[3.0, 3.0], [3.2, 3.0], [3.0, 3.2]], "53 % higher; fewer falls than base"),
-    "includes zero": ([[1.0, 1.0], [3.0, 3.0], [2.1, 2.1]], "the interval includes zero: no difference shown; fewer"),
-    "zero": ([[2.0, 2.0], [2.0, 2.0]], "the interval includes zero: no difference shown; fewer"),
+    "lower": ([[1.0, 1.0], [1.2, 1.0], [1.0, 1.2], [1.2, 1.0], [1.0, 1.2]], "45 % lower; fewer falls than base"),
+    "higher": ([[3.0, 3.0], [3.2, 3.0], [3.0, 3.2], [3.2, 3.0], [3.0, 3.2]], "55 % higher; fewer falls than base"),
+    "includes zero": (
+        [[1.0, 1.0], [3.0, 3.0], [1.5, 1.5], [2.5, 2.5], [2.1, 2.1]],
+        "the interval includes zero: no difference shown; fewer",
+    ),
+    "zero": ([[2.0, 2.0]] * 5, "the interval includes zero: no difference shown; fewer"),
     "one seed": ([[1.0, 1.0]], "50 % lower with one training seed: no interval; fewer"),
-    "falls": ([[1.0, None, None], [1.0, None, None]], "50 % lower; MORE FALLS than base"),
+    "four seeds": ([[1.0, 1.0]] * 4, "50 % lower with 4 training seeds: too few to tell it from chance; fewer"),
+    "falls": ([[1.0, None, None]] * 5, "50 % lower; MORE FALLS than base"),
     "all fall": ([[None, None], [None, None]], "nothing to compare"),
-    "a seed falls": ([[1.0, 1.0], [None, None], [1.0, 1.0]], "50 % lower; 1 of 3 training seeds have nothing to"),
+    "a seed falls": (
+        [[1.0, 1.0], [None, None], *[[1.0, 1.0]] * 4],
+        "50 % lower; 1 of 6 training seeds have",
+    ),
 }
 
 
@@ -314,7 +375,7 @@ def test_conditions_are_marked_by_what_training_has_seen() -> None:
         ("ideal", 3, (CEILING,)),
         ("ideal+soft", 3, (CEILING,)),
         ("ideal+spread", 3, ()),
-        ("soft", {"step_period": 3, "num_steps": 2}, ()),
+        ("soft", {"step_period": 3, "num_steps": 2}, (SAME_ROBOT,)),
         ("slope", 3, ("held out",)),
         ("ideal", 1.6, ("held out step period",)),
         ("slope", 1.6, ("held out scenario and step period",)),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -344,6 +345,12 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     features = np.random.default_rng(1).normal(size=(20, network.num_features))
     expected, _ = model.predict(venv.normalize_obs(features), deterministic=True)
     np.testing.assert_allclose(network(features), expected, rtol=0.0, atol=1e-6)
+    Path("c.yaml").write_text(json.dumps({**given, "settings": {**given["settings"], "history": 3}}))
+    with pytest.raises(SystemExit):
+        main([*arguments, "--trust-pickle", "--output", "runs/other"])
+    assert re.search(
+        r"takes \d+ features and gives 1 residuals, a residual on input of the testbed", capsys.readouterr().err
+    )
     Path("no.zip").write_bytes(b"nothing")
     with pytest.raises(SystemExit):
         main(["export", "no.zip", "c.yaml", "--trust-pickle"])

@@ -17,6 +17,7 @@ import pytest
 import torch
 import yaml
 from gymnasium.vector import AutoresetMode
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import baselines
 from baselines.residual import load_residual
@@ -100,6 +101,8 @@ def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     assert one.keys() == other.keys()
     for name, tensor in one.items():
         np.testing.assert_array_equal(tensor, other[name], err_msg=name)
+    events = EventAccumulator(str(tmp_path / "whole" / "tensorboard")).Reload()
+    assert {"rollout/ep_rew_mean", "train/learning_rate"} <= set(events.Tags()["scalars"])
     assert (tmp_path / "whole" / "progress.csv").read_text().splitlines()[-1] == (
         (tmp_path / "part" / "progress.csv").read_text().splitlines()[-1]
     )
@@ -405,6 +408,10 @@ def test_train_command_trains_every_seed_and_resumes(
         ({"weights": {"nominal": -1.0}}, "greater than 0"),
         ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
         ({"base": "zero"}, "compensates none; use space 'joint'"),
+        ({"algorithm_options": {"foo": 1}}, "PPO cannot be built with algorithm_options .*foo"),
+        ({"algorithm_options": {"policy_kwargs": {"activation_fn": "Foo"}}}, "PPO cannot be built .*Foo"),
+        ({"algorithm_options": {"learning_rate": "x"}}, "PPO cannot be built .*'x'"),
+        ({"seeds": [0, 1, 0]}, r"can stand but once, got \[0, 1, 0\]"),
     ],
 )
 def test_a_training_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -451,6 +458,8 @@ def test_a_candidate_that_falls_comes_last(monkeypatch: pytest.MonkeyPatch, tmp_
     [
         ({"worlds": 7}, "each of 8 candidates in each scenario, 8, got worlds: 7"),
         ({"algorithm_options": {"popsize": 8}}, "'popsize'.*population_size"),
+        ({"algorithm_options": {"population_size": 0}}, "population_size >= 2 and a sigma > 0, got 0 and 0.3"),
+        ({"algorithm_options": {"sigma": "wide"}}, "CMA-ES cannot be built .*'wide'"),
     ],
 )
 def test_a_search_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Learning algorithms by name."""
 
 import importlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import stable_baselines3
@@ -25,3 +27,20 @@ def algorithm_class(name: str) -> Any:
     if name not in known:
         raise unknown_name("algorithm", name, [*known, CONSTANTS, "module:Class"])
     return getattr(stable_baselines3, name)
+
+
+@contextmanager
+def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
+    """Name algorithm and options in what it raises while it is built from them.
+
+    Raises:
+        ConfigurationError: It does not take them.
+    """
+    try:
+        yield
+    except ConfigurationError:
+        raise
+    except (TypeError, ValueError, AssertionError, AttributeError, ArithmeticError) as error:
+        raise ConfigurationError(
+            f"{algorithm} cannot be built with algorithm_options {dict(options)}: {error or type(error).__name__}"
+        ) from error

@@ -12,8 +12,12 @@ from train.evaluate import Evaluation
 from train.families import Origin, origin
 from train.statistics import Estimate, change, improvement, over_seeds, pair
 
-CEILING, HELD_OUT = "ceiling on the training condition", "held out"
-"""Scenario in which nothing is random: training and evaluation see the same."""
+CEILING, HELD_OUT, SAME_ROBOT = "ceiling on the training condition", "held out", "trained robot"
+"""Scenario in which nothing is random: training and evaluation see the same; one that training never saw; one whose
+only robot is that of the training, so that evaluation differs by noise alone."""
+FEWEST_SEEDS = 5
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
+misses the truth, over five every eleventh."""
 
 _SMALL = 0.0995
 """Below it a share is shown with a decimal."""
@@ -75,10 +79,15 @@ class Change:
         return len(self.per_seed) if self.is_family else 0
 
     @property
+    def num_compared(self) -> int:
+        """Training seeds that have something to compare."""
+        return int(np.isfinite(self.per_seed).sum())
+
+    @property
     def verdict(self) -> str:
-        """lower, higher, none (the interval includes zero), or unclear (there is no interval)."""
+        """lower, higher, none (the interval includes zero), or unclear (too few training seeds to say)."""
         low, high = self.relative.low, self.relative.high
-        if low is None or high is None:
+        if low is None or high is None or self.num_compared < FEWEST_SEEDS:
             return "unclear"
         return "lower" if high < 0.0 else "higher" if low > 0.0 else "none"
 
@@ -96,7 +105,7 @@ class Change:
     def sentence(self) -> str:
         """What the row shows, and what it does not."""
         parts = [self._first_words()]
-        missing = int(np.sum(~np.isfinite(self.per_seed)))
+        missing = len(self.per_seed) - self.num_compared
         if self.is_family and 0 < missing < self.num_seeds:
             parts.append(f"{missing} of {self.num_seeds} training seeds have nothing to compare and are not in it")
         if self.falls_more:
@@ -108,7 +117,8 @@ class Change:
     def _first_words(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            return "nothing to compare: in no episode did both stay up to the end"
+            where = "one of the scenarios" if self.is_group else "no episode"
+            return f"nothing to compare: in {where} did {'not ' * self.is_group}both stay up to the end"
         direction = (
             "no change"
             if value == 0.0
@@ -120,8 +130,14 @@ class Change:
             "lower": direction,
             "higher": direction,
             "none": "the interval includes zero: no difference shown",
-            "unclear": f"{direction} with one training seed: no interval",
+            "unclear": f"{direction} with {self._few_seeds}",
         }[self.verdict]
+
+    @property
+    def _few_seeds(self) -> str:
+        if self.num_compared == 1:
+            return "one training seed: no interval"
+        return f"{self.num_compared} training seeds: too few to tell it from chance"
 
 
 def percent(value: float, signed: bool = True) -> str:
@@ -285,8 +301,13 @@ def _marks(
         return (f"{HELD_OUT}{named}" if seen else f"{HELD_OUT}{named or ' scenario'} and {quantity}",)
     if not seen:
         return (f"{HELD_OUT} {quantity}",)
-    deterministic = any(known.is_deterministic(scenario, motion) for scenario in scenarios)
-    return (CEILING,) if deterministic and not swept else ()
+    if swept:
+        return ()
+    if any(known.is_deterministic(scenario, motion) for scenario in scenarios):
+        return (CEILING,)
+    same = [scenario for scenario in scenarios if known.differs_by_noise_alone(scenario, motion)]
+    named = f": {', '.join(same)}" if len(same) < len(scenarios) else ""
+    return (f"{SAME_ROBOT}{named}",) if same else ()
 
 
 def _motion(known: Environment, reference: Any) -> str:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from train.changes import CEILING, HELD_OUT, Change, by_line, percent_interval
+from train.changes import CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
 from train.statistics import Estimate
 
 
@@ -74,7 +74,7 @@ def changes_table(rows: Sequence[Change]) -> Table:
     whose = "" if named else f"{escape(policies[0])}: "
     table = Table(
         title=f"{whose}change against the base on the same episodes, {over}",
-        caption=", ".join([*signs, "* no interval, or one that includes zero: no difference shown"]),
+        caption=", ".join([*signs, "* an interval that includes zero, or too few training seeds: no difference shown"]),
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
     )  # fmt: skip
     for name in (*named, "reference", "scenario", *swept):
@@ -100,7 +100,7 @@ def changes_table(rows: Sequence[Change]) -> Table:
     return table
 
 
-_SIGNS = {HELD_OUT: "°", CEILING: "†"}
+_SIGNS = {HELD_OUT: "°", CEILING: "†", SAME_ROBOT: "‡"}
 
 
 def _signs(row: Change) -> str:

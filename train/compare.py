@@ -80,6 +80,11 @@ class CompareConfig(Model):
         for title in titles:
             if titles.count(title) > 1:
                 raise ConfigurationError(f"two policies are called {title!r}; give one of them a label")
+        if self.sweep is not None and all(policy.level for policy in self.policies):
+            raise ConfigurationError("a sweep needs a policy that it varies; level: true leaves all of them out of it")
+        _require_each_once("reference", self._reference_names())
+        _require_each_once("scenario", self.scenarios)
+        _require_each_once("value of the sweep", self.sweep.values if self.sweep else [])
         for title in self.figure_policies:
             if title not in titles:
                 raise unknown_name("policy of the figures", title, titles)
@@ -125,6 +130,12 @@ class CompareConfig(Model):
         if self.sweep is None or policy.level:
             return [{}]
         return [{self.sweep.option: value} for value in self.sweep.values]
+
+    def _reference_names(self) -> list[str]:
+        """What tables call the references."""
+        known = environment(self.env)
+        labels = self._reference_labels()
+        return [label or known.label(reference) for label, reference in zip(labels, self.references, strict=True)]
 
     def _reference_labels(self) -> list[str | None]:
         """Names that tell references of one kind apart by their parameters; None where the kind is enough."""
@@ -183,6 +194,12 @@ def compare(
     print_summary(cells, console)
     print_changes(rows, console)
     return Comparison(folder, evaluations, files)
+
+
+def _require_each_once(what: str, values: Sequence[object]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise ConfigurationError(f"the {what} {value!r} stands twice; its episodes would count double")
 
 
 def try_out(conditions: Sequence[Condition]) -> None:

@@ -15,6 +15,7 @@ from cmaes import CMA
 from baselines.residual import ResidualDescription
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.signals import Array
+from train.algorithms import options_named
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
 from train.trainer import Trainer
 
@@ -45,7 +46,12 @@ class ConstantSearch(Trainer):
         if options.keys() != _DEFAULTS.keys():
             raise unknown_name("option of CMA-ES", (options.keys() - _DEFAULTS.keys()).pop(), _DEFAULTS)
         super().__init__(config, seed, folder, threads)
-        self._population = int(options["population_size"])
+        with options_named(config.algorithm, config.algorithm_options):
+            self._population, sigma = int(options["population_size"]), float(options["sigma"])
+        if self._population < 2 or not sigma > 0.0:
+            raise ConfigurationError(
+                f"CMA-ES needs a population_size >= 2 and a sigma > 0, got {self._population} and {sigma:g}"
+            )
         episodes = config.worlds // (len(config.scenarios) * self._population)
         if episodes == 0:
             needed = len(config.scenarios) * self._population
@@ -59,7 +65,7 @@ class ConstantSearch(Trainer):
         (num_constants,) = self._worlds.single_action_space.shape or (0,)
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
         self._optimiser = CMA(
-            mean=np.zeros(num_constants), sigma=float(options["sigma"]), bounds=bounds, seed=seed,
+            mean=np.zeros(num_constants), sigma=sigma, bounds=bounds, seed=seed,
             population_size=self._population,
         )  # fmt: skip
         self._told: list[list[float]] = []

@@ -138,6 +138,10 @@ class Environment:
         """Whether all episodes of a condition are one and the same."""
         return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
 
+    def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
+        """Whether the episodes of a condition are of one robot and one motion."""
+        return not (self.is_real or make_scenario(scenario).draws_robots or self.draws(reference))
+
     @property
     def failures(self) -> str:
         """What such episodes are called in a sentence."""

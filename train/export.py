@@ -1,12 +1,12 @@
 """Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without torch."""
 
 import pickle
-import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.spaces.utils import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
@@ -14,7 +14,7 @@ from baselines.residual import save_residual
 from elastic_env.errors import ConfigurationError
 from train.algorithms import algorithm_class
 from train.runs import provenance
-from train.train_config import TrainConfig
+from train.train_config import TrainConfig, training_worlds
 
 Tensors = dict[str, npt.NDArray[Any]]
 
@@ -53,6 +53,20 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
     return tensors, names[activations.pop()], output  # type: ignore[return-value]
 
 
+def _require_fit(tensors: Tensors, config: TrainConfig) -> None:
+    """Compare the widths of a network with what the configuration's residual sees and does."""
+    worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
+    sees, does = flatdim(worlds.single_observation_space), flatdim(worlds.single_action_space)
+    worlds.close()
+    last = max(int(name.removeprefix("bias")) for name in tensors if name.startswith("bias"))
+    given = tensors["weight0"].shape[1], len(tensors[f"bias{last}"])
+    if given != (sees, does):
+        raise ConfigurationError(
+            f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on {config.base} of the "
+            f"{config.env} with these settings sees {sees} and gives {does}"
+        )
+
+
 def export_zip(
     path: Path, config: TrainConfig, output: Path, normaliser: Path | None = None, trust_pickle: bool = False
 ) -> Path:
@@ -78,9 +92,13 @@ def export_zip(
     try:
         model = algorithm_class(config.algorithm).load(path, device="cpu")
         statistics = None if normaliser is None else pickle.loads(normaliser.read_bytes())
-    except (ValueError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError, AssertionError) as error:
-        raise ConfigurationError(f"{path} is no model that SB3's {config.algorithm} saved: {error}") from None
-    tensors, activation, kind = network_of(model, statistics)
+        tensors, activation, kind = network_of(model, statistics)
+    except ConfigurationError:
+        raise
+    except Exception as error:  # whatever a pickle of something else leads to
+        files = " with ".join(str(file) for file in (path, normaliser) if file is not None)
+        raise ConfigurationError(f"{files} is no model that SB3's {config.algorithm} saved: {error}") from error
+    _require_fit(tensors, config)
     training = {"config": config.model_dump(mode="json"), **provenance(None), "exported_from": path.name}
     description = config.description(activation=activation, output=kind, training=training)
     save_residual(output, description, tensors)

@@ -73,7 +73,7 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
         description = members[0][2]
         base = next((known for known in bases if _plays(known, description, policy)), None)
         if base is None:
-            base = _base(description, policy, bases)
+            base = _base(description, policy, [*policies, *bases])
             if with_bases:
                 bases.append(base)
                 entrants.append(Entrant(base))
@@ -151,11 +151,12 @@ def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, 
     first, _, expected = members[0]
     seen: dict[int, Path] = {}
     for folder, seed, description in members:
-        for what, mine, other in zip(_KIN, _kin(description), _kin(expected), strict=True):
-            if mine != other:
+        mine, theirs = _kin(description), _kin(expected)
+        for what in {**mine, **theirs}:
+            if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
-                    f"{pattern!r} must match training seeds of one configuration, but {what} of {folder} is {mine!r} "
-                    f"and of {first} {other!r}; give each an entry of its own"
+                    f"{pattern!r} must match training seeds of one configuration, but {what} of {folder} is "
+                    f"{mine.get(what)!r} and of {first} {theirs.get(what)!r}; give each an entry of its own"
                 )
         if seed is None:
             raise ConfigurationError(
@@ -166,15 +167,15 @@ def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, 
         seen[seed] = folder
 
 
-_KIN = ("robot", "base", "base_options", "settings", "the trained scenarios", "the trained reference")
+_OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_every")
+"""Keys of a training configuration in which the seeds of a family may differ."""
 
 
-def _kin(description: ResidualDescription) -> tuple[object, ...]:
+def _kin(description: ResidualDescription) -> dict[str, object]:
+    """What the members of a family have in common."""
     config = description.training.get("config", {})
-    return (
-        description.robot, description.base, description.base_options, description.settings,
-        config.get("scenarios"), config.get("reference"),
-    )  # fmt: skip
+    trained = {f"the trained {name}": value for name, value in config.items() if name not in _OWN}
+    return trained | {name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")}
 
 
 def _plays(known: PolicySpec, description: ResidualDescription, residual: PolicySpec) -> bool:

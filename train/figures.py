@@ -13,7 +13,7 @@ from train.walk_plots import draw_pelvis, draw_zmp, paper_figure
 
 Draw = Callable[[Sequence[Evaluation], Path], Path]
 
-MIN_SWEPT_REFERENCES = 3
+_MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
 
 
@@ -83,7 +83,7 @@ def reference_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
 
 
 def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment, folder: Path) -> list[Path]:
-    if len({e.condition.number for e in evaluations} - {None}) < MIN_SWEPT_REFERENCES:
+    if not has_swept_references(evaluations):
         return []
     scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
     return [
@@ -121,3 +121,10 @@ _FIGURES: dict[str, Draw] = {
     "pelvis": draw_pelvis,
     "zmp": draw_zmp,
 }
+
+
+def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
+    """Whether the references are points of one axis: enough of them have a number, and each one of its own."""
+    numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
+    known = [number for number in numbers.values() if number is not None]
+    return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)

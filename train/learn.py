@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual import ResidualDescription
-from train.algorithms import algorithm_class
+from train.algorithms import algorithm_class, options_named
 from train.export import network_of
 from train.sb3_env import SB3VecEnv
 from train.state import capture, read_state, restore, write_state
@@ -63,11 +63,11 @@ class Training(Trainer):
         self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
         set_random_seed(seed)
         self._normaliser.seed(FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed)
-        self.model: Any = algorithm_class(config.algorithm)(
-            "MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options)
-        )
-        self._learning_rate = float(self.model.lr_schedule(1.0))
-        self._shrink_last_layer()
+        algorithm = algorithm_class(config.algorithm)
+        with options_named(config.algorithm, config.algorithm_options):
+            self.model: Any = algorithm("MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options))
+            self._learning_rate = float(self.model.lr_schedule(1.0))
+            self._shrink_last_layer()
         self.model.action_space.seed(seed)
         self._folder_ready()
         if (folder / "checkpoint").is_dir():
@@ -84,7 +84,7 @@ class Training(Trainer):
         if self.config.anneal:
             rate = self._learning_rate * (1.0 - before / self.config.decisions)
             self.model.lr_schedule = lambda _: rate
-        self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=10**9)
+        self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=1)
 
     def checkpoint(self) -> None:
         """Keep everything that the rest of the training depends on; a kill between its steps loses nothing."""
@@ -224,13 +224,13 @@ class Training(Trainer):
 
 
 def _merged(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    policy = {**defaults.get("policy_kwargs", {}), **given.get("policy_kwargs", {})}
+    policy = {**defaults.get("policy_kwargs", {}), **(given.get("policy_kwargs") or {})}
     return {**defaults, **given, **({"policy_kwargs": policy} if policy else {})}
 
 
 def _resolved(options: dict[str, Any]) -> dict[str, Any]:
     """Options with the activation's class in the place of its name."""
-    policy = dict(options.get("policy_kwargs", {}))
+    policy = dict(options.get("policy_kwargs") or {})
     if isinstance(policy.get("activation_fn"), str):
         policy["activation_fn"] = getattr(torch.nn, policy["activation_fn"])
     return {**options, "policy_kwargs": policy}

@@ -122,6 +122,8 @@ def improvement(seeds: Sequence[Sequence[Pairs]]) -> Estimate:
     Returns:
         Share of all pairs of training seed and episode, with an interval over training seeds.
     """
+    # as in `change`: without one of the scenarios it would be a share over other ones
+    seeds = [scenarios for scenarios in seeds if all(map(len, scenarios))]
     counts = [sum(map(len, scenarios)) for scenarios in seeds]
     wins = [sum(_wins(pairs) for pairs in scenarios) for scenarios in seeds]
     both = sorted((w, n) for w, n in zip(wins, counts, strict=True) if n > 0)

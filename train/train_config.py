@@ -51,7 +51,7 @@ class TrainConfig(Model):
     clip: float = quantity("1", 10.0, gt=0, description="bound of normalised features, in standard deviations")
     worlds: int = quantity("1", 64, ge=2, description="worlds, shared out to the scenarios")
     decisions: int = quantity("1", 200_000, ge=1, description="decisions of all worlds together")
-    seeds: list[Annotated[int, Field(ge=0)]] = Field(default=[0], min_length=1)
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1)
     """Training seeds, each a run of its own."""
     evaluate_every: int = quantity("1", 20_000, ge=1, description="decisions between evaluations")
     evaluation_episodes: int = quantity("1", 4, ge=1, description="episodes per scenario in an evaluation")
@@ -65,6 +65,13 @@ class TrainConfig(Model):
             if name not in self.scenarios:
                 raise ValueError(f"weights must be of scenarios that are learned from, {self.scenarios}, got {name!r}")
         return self
+
+    @field_validator("seeds")
+    @classmethod
+    def _each_seed_once(cls, seeds: list[int]) -> list[int]:
+        if len(set(seeds)) < len(seeds):
+            raise ValueError(f"every training seed has a folder of its own and can stand but once, got {seeds}")
+        return seeds
 
     @property
     def motion(self) -> Any:

@@ -144,7 +144,7 @@ class Compare:
         if arguments:
             real = place(config.env, arguments)
             real["env_options"] = {**config.env_options, **real["env_options"]}
-            config = config.replace(scenarios=["hardware"], scenario_episodes={}, **real)
+            config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
         _print_files(compare(config, CONSOLE, self.output, self.jobs))
 
 

@@ -135,7 +135,7 @@ def forest(rows: Sequence[Change]) -> Chart:
 
 
 _VERDICT_WORDS = {
-    "lower": "lower", "higher": "higher", "none": "no difference shown", "unclear": "no interval: one training seed"
+    "lower": "lower", "higher": "higher", "none": "no difference shown", "unclear": "too few training seeds"
 }  # fmt: skip
 
 

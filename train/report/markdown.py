@@ -30,7 +30,7 @@ def markdown(results: Results) -> str:
 
 def _changes_markdown(rows: Sequence[Change], swept: Sequence[str]) -> str:
     head = ["policy", "base", "reference", "scenario", *swept, "metric", "base → policy", "change", "better than base",
-            "falls (base)", "what it shows"]  # fmt: skip
+            f"{rows[0].failure} (base)", "what it shows"]  # fmt: skip
     lines = []
     for row in (row for line in by_line(rows) for row in line):
         number = f".{row.column.decimals}f"

@@ -4,7 +4,10 @@ import json
 from collections.abc import Mapping, Sequence
 from html import escape
 
+import numpy as np
+
 from train.changes import CEILING, Change, by_line, percent_interval
+from train.changes_tables import falls
 from train.report.parts import FONT, VERDICTS, Chart
 
 _STYLE = """
@@ -199,7 +202,7 @@ def _change_row(row: Change, swept: Sequence[str], is_first: bool, with_sentence
     values = [f"{row.swept[name]:g}" if name in row.swept else "-" for name in swept] if is_first else [""] * len(swept)
     before, after = (f"{row.column.scale * value:.{row.column.decimals}f}" for value in (row.theirs, row.mine))
     figures = [
-        f"{before} → {after} {row.column.unit}" if row.num_pairs else "-",
+        f"{before} → {after} {row.column.unit}" if np.isfinite(row.mine) else "-",
         f'<b style="color:{VERDICTS[row.verdict]}">{percent_interval(row.relative)}</b>',
         percent_interval(row.improvement, signed=False),
         _falls(row) if is_first else "",
@@ -214,8 +217,7 @@ def _change_row(row: Change, swept: Sequence[str], is_first: bool, with_sentence
 
 
 def _falls(row: Change) -> str:
-    text = f"{row.falls}/{row.episodes} ({row.base_falls}/{row.base_episodes})"
-    return f'<span class="falls">{text}</span>' if row.falls_more else text
+    return f'<span class="falls">{falls(row)}</span>' if row.falls_more else falls(row)
 
 
 def _number(column: int, words: int) -> str:

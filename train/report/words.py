@@ -7,7 +7,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from train.changes import CEILING, HELD_OUT, Change, by_cell, families, level, percent_interval
+from train.changes import (
+    CEILING,
+    FEWEST_SEEDS,
+    HELD_OUT,
+    SAME_ROBOT,
+    Change,
+    by_cell,
+    families,
+    level,
+    percent_interval,
+)
 from train.environments import Column
 from train.evaluate import Evaluation
 from train.families import Origin
@@ -64,7 +74,7 @@ class Results:
     @property
     def swept_options(self) -> list[str]:
         """Names of the options that a sweep varies."""
-        return list(dict.fromkeys(name for row in self.changes for name in row.swept))
+        return list(dict.fromkeys(name for e in self.evaluations for name in e.condition.swept))
 
 
 def what(results: Results) -> list[tuple[str, str]]:
@@ -129,7 +139,7 @@ def _tally(cells: Sequence[Change]) -> str:
         "lower": [row for row in cells if row.verdict == "lower"],
         "higher": [row for row in cells if row.verdict == "higher"],
         "no difference shown (the interval includes zero)": [row for row in cells if row.verdict == "none"],
-        "no interval": [row for row in cells if row.verdict == "unclear"],
+        "too few training seeds to tell": [row for row in cells if row.verdict == "unclear"],
     }
     parts = [f"{words} in {len(rows)}" for words, rows in counts.items() if rows]
     return f"of {len(cells)} cells " + ", ".join(parts)
@@ -150,15 +160,17 @@ def notes(results: Results) -> list[str]:
     """What a reader needs to know, and only what concerns this comparison."""
     failure = results.lines.environment.failures
     notes = [
-        "A change is, per training seed, the mean over episodes with the residual over the mean over the same "
-        "episodes of its base, minus one. An episode in which either did not reach the end is left out of both and "
-        f"counted under {failure}. Below zero is better.",
+        "A change is the mean of a policy over the episodes, over the mean of its base over the same episodes, minus "
+        "one. An episode in which either did not reach the end is left out of both and counted under "
+        f"{failure}. Below zero is better.",
     ]
     if results.families:
         notes.append(
             "Figures of residuals are interquartile means over training seeds with 95 % percentile bootstrap "
-            "intervals over training seeds (never over the episodes of one). A base has no training seed, so it has no "
-            "interval. Pooled: means over scenarios are compared, per training seed."
+            "intervals over training seeds (never over the episodes of one); where a table shows base → policy, plain "
+            "means. With five training seeds such an interval misses the truth in one of eleven cases, with ten in one "
+            "of sixteen; fewer than five are not judged. A base has no training seed, so it has no interval. Pooled: "
+            "means over scenarios are compared, per training seed."
         )
         notes.append(
             "Better than base: share of all pairs of training seed and episode in which the residual is ahead, ties "
@@ -172,9 +184,16 @@ def notes(results: Results) -> list[str]:
             f"Marked {CEILING!r}: the scenario is deterministic and the residual was trained on it, so that training "
             "and evaluation see the same. It says what is possible, not what is to be expected."
         )
+    if any(mark.startswith(SAME_ROBOT) for mark in marks):
+        notes.append(
+            f"Marked {SAME_ROBOT!r}: training and evaluation have the same robot and motion there, and differ by "
+            "sensor noise alone. It says that the residual has learned this robot, not that it fits others."
+        )
     for title, origin in results.families.items():
         if len(origin.folders) == 1:
             notes.append(f"{title} is a single training seed: another one may come out differently.")
+        elif len(origin.folders) < FEWEST_SEEDS:
+            notes.append(f"{title} has but {len(origin.folders)} training seeds: too few to judge by its intervals.")
         if origin.missing_seeds:
             missing = ", ".join(map(str, origin.missing_seeds))
             notes.append(f"{title} lacks training seeds of its configuration: {missing}.")

@@ -5,14 +5,13 @@ from pathlib import Path
 
 from elastic_env.errors import missing_extra
 from train.evaluate import Evaluation
-from train.figures import MIN_SWEPT_REFERENCES
+from train.figures import has_swept_references
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
 from train.report.markdown import markdown
 from train.report.page import Page, changes_html, definitions, fold, table
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
 
-"""From so many references with a number of their own on, the scores are drawn against it."""
 _LONG = 40
 """Rows from which on a table is folded away."""
 
@@ -89,7 +88,7 @@ def _add_changes(page: Page, results: Results) -> None:
         marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
         page.text(
             "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below "
-            f"zero; red: above; grey: it includes zero, or there is none.{marks}"
+            f"zero; red: above; grey: it includes zero, or there are too few training seeds.{marks}"
         )
         for title in dict.fromkeys(row.policy for row in trained if drawn):
             own = [row for row in trained if row.policy == title and row.is_judged]
@@ -142,7 +141,7 @@ def _add_sweeps(page: Page, results: Results) -> None:
                     t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
                 }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
-    elif len({e.condition.number for e in results.evaluations} - {None}) >= MIN_SWEPT_REFERENCES:
+    elif has_swept_references(results.evaluations):
         for scenario in lines.scenarios:
             points = {t: _by_number(lines.cell(t, scenario=scenario)) for t in lines.titles}
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
