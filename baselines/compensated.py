@@ -65,36 +65,44 @@ class Compensated:
             episode_start: As in `predict`.
             deterministic: As in `predict`.
         """
-        rows = self._view.rows(observation)
+        rows, n = self._view.rows(observation), len(self.compensator.model.joint_names)
         desired, compensator = self._view.motion(rows), self.compensator.at(rows)
         memory, inner_state = resume(
-            state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1, 0)))
+            state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1 + n, 0)))
         )
-        seen = self._seen(compensator, rows, memory[:, 1:], correction)
+        own = memory[:, 1 + n :]
+        links = self._links(compensator, rows, own, correction)
+        seen = self._seen(compensator, rows, links)
         action, inner_state = self.policy.predict(
             seen if observation.ndim > 1 else seen[0], inner_state, episode_start, deterministic
         )
         action = np.atleast_2d(np.asarray(action, dtype=np.float64))
-        offset, kept = compensator.offset(desired.shifted(action), memory[:, 1:])
+        offset, kept = compensator.offset(desired.shifted(action), own)
         if correction is not None:
             offset = offset + correction * compensator.deflection(offset, kept)
         steps = memory[:, :1] + 1.0
         total = (action + self._ramp.share(steps) * offset).astype(np.float32)
-        return total.reshape((*observation.shape[:-1], total.shape[-1])), (np.hstack([steps, kept]), inner_state)
+        return total.reshape((*observation.shape[:-1], n)), (np.hstack([steps, links, kept]), inner_state)
 
-    def link_estimate(self, observation: Array, state: Any, correction: Array | None = None) -> Array:
-        """Estimated link angle for an observation and the state that `predict` returned for it, (..., n) [rad]."""
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angle that the policy saw in the place of an observation's encoders, (..., n) [rad].
+
+        Args:
+            observation: As in `predict`.
+            state: What `predict` returned for it.
+        """
         memory, _ = state
-        rows = self._view.rows(observation)
-        estimate = self._links(self.compensator.at(rows), self._view.theta(rows), memory[:, 1:], correction)
-        return estimate.reshape((*observation.shape[:-1], estimate.shape[-1]))
+        n = len(self.compensator.model.joint_names)
+        return memory[:, 1 : 1 + n].reshape((*observation.shape[:-1], n))
 
-    def _links(self, compensator: Compensator, theta: Array, memory: Array, correction: Array | None) -> Array:
+    def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
+        """The links' angles by the encoders."""
+        theta = self._view.theta(rows)
         q = compensator.link_angle(theta, memory)
         return q if correction is None else q - correction * (theta - q)
 
-    def _seen(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
+    def _seen(self, compensator: Compensator, rows: Array, links: Array) -> Array:
         """The observations with the links' angles and rates where they have the encoders'."""
-        theta, theta_dot = self._view.theta(rows), self._view.theta_dot(rows)
-        rate = compensator.link_rate(theta, theta_dot) if self._shows_rates else theta_dot
-        return self._view.with_links(rows, self._links(compensator, theta, memory, correction), rate)
+        theta_dot = self._view.theta_dot(rows)
+        rate = compensator.link_rate(self._view.theta(rows), theta_dot) if self._shows_rates else theta_dot
+        return self._view.with_links(rows, links, rate)

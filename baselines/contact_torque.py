@@ -157,7 +157,7 @@ class BoundPlannedTorque:
         """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
         if np.array_equal(q, self.q_ref):
             return self.torque
-        return self.torque + self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref)
+        return self.torque + (self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref))
 
 
 def _block_diagonal(blocks: Array) -> Array:

@@ -175,7 +175,4 @@ class Corrected:
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Estimated link angle for an observation and the state that `act` returned for it, (..., n) [rad]."""
-        correction, inner = state
-        if self.settings.space == "model":
-            return self.base.link_estimate(observation, inner, correction)  # type: ignore[attr-defined]
-        return self.base.link_estimate(observation, inner)  # type: ignore[attr-defined]
+        return self.base.link_estimate(observation, state[1])  # type: ignore[attr-defined]

@@ -205,12 +205,11 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         self._begin(worlds)
         fresh = self._worlds.signals()
         info = _restarted_info(result.info, worlds, fresh)
+        terminated, truncated = result.terminated & ~worlds, result.truncated & ~worlds
+        if not (terminated | truncated).any():  # what ended had ended before
+            info = _without_metrics(info)
         return Transition(
-            self._worlds.task.observe(),
-            np.where(worlds, 0.0, result.reward),
-            result.terminated & ~worlds,
-            result.truncated & ~worlds,
-            info,
+            self._worlds.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info
         )
 
     def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
@@ -221,8 +220,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         final_info = _with_mask(result.info, result.done)
         self._begin(result.done)
         fresh = self._worlds.signals()
-        info = _restarted_info(result.info, result.done, fresh)
-        del info["episode_metrics"]
+        info = _without_metrics(_restarted_info(result.info, result.done, fresh))
         info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
         info |= {"final_info": final_info, "_final_info": result.done.copy()}
         return self._worlds.task.observe(), info
@@ -254,7 +252,13 @@ def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> 
     changed = info | {key: np.where(worlds, value, info[key]) for key, value in fresh.items()}
     changed["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
     changed["termination"] = np.where(worlds, "", info["termination"])
+    changed["clipped"] = np.where(worlds, 0.0, info["clipped"])
     return changed
+
+
+def _without_metrics(info: dict[str, Any]) -> dict[str, Any]:
+    """The info of a step in which no episode has ended."""
+    return {key: value for key, value in info.items() if key not in ("episode_metrics", "_episode_metrics")}
 
 
 def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:

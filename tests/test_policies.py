@@ -513,6 +513,27 @@ def test_link_estimate_at_rest_is_the_link_angle(name: str, options: Any, tolera
     np.testing.assert_allclose(estimate, q, rtol=0.0, atol=tolerance)
 
 
+@pytest.mark.parametrize("name", ["input", "dynamic"])
+def test_link_estimate_in_motion_is_what_the_policy_saw(name: str) -> None:
+    """Catches an estimate of the next control period beside the encoders of this one."""
+    env = vector(2, scenario="ideal")
+    seen = []
+
+    class Watching:
+        def predict(self, observation: Any, state: Any = None, *_: Any) -> Any:
+            seen.append(observation[:, [column(env, "encoder_angle")]])
+            return np.zeros((len(observation), 1)), state
+
+    policy = baselines.Compensated(Watching(), baselines.make(name, env).compensator)
+    observation, _ = env.reset(seed=0)
+    state = None
+    for _ in range(300):
+        action, state = policy.predict(observation, state)
+        np.testing.assert_array_equal(policy.link_estimate(observation, state), seen[-1])
+        observation = env.step(action)[0]
+    assert np.ptp(seen) > 0.01
+
+
 def test_zero_takes_the_encoder_for_the_link() -> None:
     """Catches an uncompensated policy that is credited with an estimate it does not make."""
     env = vector(2)

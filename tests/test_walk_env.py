@@ -501,6 +501,8 @@ def test_random_actions_end_in_falls_with_a_reason_and_never_in_bad_numbers() ->
         np.testing.assert_allclose(info["time_s"], np.where(done, 0.0, time + PERIOD_S), rtol=0.0, atol=1e-9)
         moved = np.abs(env.simulation.qpos - qpos)[~done]
         assert moved.max(initial=0.0) < 0.1  # a silent reset would bring a fallen robot up at once
+        assert not {"episode_metrics", "_episode_metrics"} & info.keys()  # of an episode that began, there are none
+        assert not (info["clipped"] * done).any()
         if done.any():
             reasons = info["final_info"]["termination"]
             assert np.isin(reasons[terminated], ["fell", "diverged"]).all()
@@ -1149,6 +1151,31 @@ def test_penalties_never_saturate() -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 # Ends
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_metrics_of_an_episode_come_once() -> None:
+    """Catches an episode that is counted again in the step in which its world begins anew."""
+    env = walk_worlds(2, autoreset_mode=AutoresetMode.NEXT_STEP)
+    env.reset(seed=0)
+    actions = np.array([np.full(12, 0.3), np.zeros(12)], dtype=np.float32)
+    ends = 0
+    for _ in range(NUM_STEPS - 1):
+        _, _, terminated, truncated, info = env.step(actions)
+        done = terminated | truncated
+        ends += int(done.sum())
+        assert ("episode_metrics" in info) == done.any()
+        assert "_episode_metrics" not in info or np.array_equal(info["_episode_metrics"], done)
+    assert ends > 1
+
+
+def test_friction_is_that_of_the_soles() -> None:
+    """Catches the friction of the floor, which MuJoCo takes where it is the larger one."""
+    for options, expected in (({}, 1.0), ({"robot": {"friction": 0.4}}, 0.4), ({"robot": {"friction": 1.3}}, 1.3)):
+        env = make_walk(**SHORT, **options)
+        env.reset(seed=0)
+        contact = env.unwrapped.simulation._data.contact
+        assert len(contact) > 0
+        np.testing.assert_array_equal(contact.friction[:, 0], expected)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -50,7 +50,7 @@ class Thormang(Model):
     hip_half_spacing: float = quantity("m", 0.105, gt=0, description="half the distance of the hips; 0.072 in mk1")
     twin_knee: bool = False
     """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction and torque."""
-    friction: float = quantity("1", 0.8, gt=0, description="friction of the soles")
+    friction: float = quantity("1", 1.0, gt=0, description="friction of the soles on the floor")
     torso_load_kg: float = quantity("kg", 0.0, ge=0, description="mass carried in the middle of the upper body")
 
     @property
@@ -152,7 +152,7 @@ def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
     foot.add_geom(
         name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS],
         pos=[0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M], friction=[friction, 0.005, 0.0001], mass=0.0,
-        condim=4, contype=0, conaffinity=1,
+        condim=4, contype=0, conaffinity=1, priority=1,  # else the larger friction of sole and floor would count
     )  # fmt: skip
     foot.add_site(name=f"{side}_ft")
 

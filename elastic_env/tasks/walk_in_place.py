@@ -47,7 +47,7 @@ plan's world frame, x forward, y to the left:
 | `load_share` | 1 | planned share of the weight on the right foot |
 | `swing`, `single_support` | 1 | progress of the swing; 1 where one foot carries alone, else 0 |
 | `support` | 1 | support foot of the step, 0 left, 1 right |
-| `early_touchdown` | s | at a planned touch-down, how long the foot has been on the ground; 0 elsewhere |
+| `early_touchdown` | s | at a planned touch-down, time since the first touch in the second half of the swing; else 0 |
 | `clipped` | 1 | 1 where an action was beyond its bounds |
 | `reward_terms` | 1 | weighted terms of the reward, by name |
 | `termination` | | why the episode ended: "fell", "diverged", or "" |

@@ -136,7 +136,8 @@ class WalkSample(Rows):
         state: The true state.
         offset, offset_before: Command offsets of the last control period and of the one before, (n, 12) [rad].
         stiffness: True K, (n, 12) [N·m/rad].
-        contact_since: Step since which the swing foot has been on the ground, (n,); negative where it is not.
+        contact_since: Step in which the swing foot first touched in the second half of its swing, (n,); negative where
+            it has not.
     """
 
     step: IntArray
