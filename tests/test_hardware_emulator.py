@@ -9,7 +9,7 @@ from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults, damage
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.servo import EmulatedServo
+from elastic_env.hardware.emulator.servo import EmulatedServo, MotorAtRest
 from elastic_env.hardware.emulator.wire import EmulatedBus
 from elastic_env.hardware.protocol import Packet, Parser
 from elastic_env.plan import quintic
@@ -54,13 +54,12 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     assert read(servo, "max_position_limit") == 100_000
 
 
-def test_a_servo_that_gets_torque_holds_where_it_is() -> None:
-    """Catches a jump to an old goal when torque is switched on."""
-    servo = make_servo()
-    servo.motor.position = 0.25
+def test_a_servo_that_gets_torque_keeps_its_goal() -> None:
+    """Catches an emulator that forgives a program which switches torque on before it has set the goal."""
+    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motor=MotorAtRest(position=0.25))
     write(servo, "goal_position", 1000)
     write(servo, "torque_enable", 1)
-    assert servo.goal == pytest.approx(0.25, abs=servo.model.position_unit)
+    assert read(servo, "goal_position") == 1000
 
 
 def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:

@@ -71,7 +71,19 @@ def test_parser_gives_a_damaged_packet_as_damaged_and_goes_on() -> None:
     flipped = bytearray(good)
     flipped[10] ^= 1
     assert [p.is_intact for p in protocol.Parser().feed(bytes(flipped) + good)] == [False, True]
-    assert [p.parameters for p in protocol.Parser().feed(good[:9] + good)] == [b"\x00\x01\x02\x03\x04"]
+    for end in range(4, len(good)):
+        found = [p.parameters for p in protocol.Parser().feed(good[:end] + good) if p.is_intact]
+        assert found == [b"\x00\x01\x02\x03\x04"]
+
+
+def test_a_checksum_that_completes_a_header_is_no_header() -> None:
+    """Catches a packet that is dropped for the header in its end: goal −26843 to id 1 ends FF FF, its CRC FD 00."""
+    goal = bytes([0x54, 2, 4, 0, 1]) + (-26_843).to_bytes(4, "little", signed=True)
+    wire = protocol.packet(protocol.BROADCAST, protocol.SYNC_WRITE, goal)
+    assert wire.endswith(protocol.HEADER)
+    parser = protocol.Parser()
+    found = [packet for byte in wire + wire for packet in parser.feed(bytes([byte]))]
+    assert [(p.parameters, p.is_intact) for p in found] == [(goal, True)] * 2
 
 
 def test_tables_have_the_registers_of_the_maker() -> None:

@@ -5,6 +5,7 @@ import pty
 import signal
 import subprocess
 import sys
+import threading
 import time
 import tty
 from collections.abc import Iterator
@@ -105,6 +106,15 @@ def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
     ]  # fmt: skip
 
 
+def test_missing_replies_do_not_hide_too_much_torque() -> None:
+    """Catches a load that lasts for ever because every second reply is lost."""
+    guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
+    strained, missing = states([0.0], current=-12.0), states([np.nan], current=np.nan, fresh=False)
+    reasons = [guard.take(s) for s in (strained, missing, strained, missing, strained)]
+    assert reasons[:4] == [""] * 4
+    assert "torque exceeds 40 N·m: it: " in reasons[4]
+
+
 def test_limits_in_the_wrong_order_are_refused() -> None:
     """Catches a range that nothing can be in."""
     with pytest.raises(ConfigurationError, match="lowest_rad"):
@@ -120,7 +130,7 @@ def running() -> Iterator[RunningEmulator]:
 @pytest.fixture
 def emulator(running: RunningEmulator) -> RunningEmulator:
     """The one emulator, without the faults that a test before may have left."""
-    running.faults(overload=False, late=0, latency_s=0)
+    running.faults(overload=False, silent=False, unheard=0, late=0, latency_s=0)
     return running
 
 
@@ -285,6 +295,57 @@ def test_overload_stops_all_and_is_named(emulator: RunningEmulator, supervised: 
         supervised.enable()
     emulator.faults(overload=False)
     assert emulator.state()["torque_on"] == [False, False]
+
+
+def test_a_supervisor_that_hangs_is_ended_and_torque_switched_off(
+    emulator: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches a program that waits for ever for an answer while a servo holds its last goal."""
+    supervised.enable(PATIENT)
+    emulator.events()
+    os.kill(supervised.process_id, signal.SIGSTOP)
+    awake = threading.Timer(10.0, os.kill, (supervised.process_id, signal.SIGCONT))  # a test must not wait for ever
+    awake.start()
+    try:
+        with pytest.raises(FaultError, match=r"did not answer within .* ms and was ended; torque is off"):
+            cycle(supervised, [0.0, 0.0])
+    finally:
+        awake.cancel()
+    assert torque_events(emulator, 0)
+    with pytest.raises(FaultError, match="torque is off"):
+        cycle(supervised, [0.0, 0.0])
+
+
+def test_a_supervisor_that_waits_for_silent_servos_is_not_taken_for_dead(
+    emulator: RunningEmulator, supervised: SupervisedBus
+) -> None:
+    """Catches a limit on its answer that is shorter than the tries to have torque off confirmed."""
+    supervised.enable()
+    emulator.events()
+    emulator.faults(silent=True)
+    with pytest.raises(FaultError, match=r"sent, but not confirmed by servo 1 at .*, servo 2 at .*: switch"):
+        cycle(supervised, [0.0, 0.0], 12)
+    emulator.faults(silent=False)
+    assert torque_events(emulator, 0)
+    supervised.disable()
+
+
+def test_instructions_that_are_lost_reach_no_servo(emulator: RunningEmulator) -> None:
+    """Catches a switch that loses replies only: the servo would have done what it was told."""
+    with Bus(emulator.port) as bus:
+        bus.attach([1, 2])
+        emulator.events()
+        emulator.faults(unheard=1.0)
+        bus.write_goals(np.zeros(2))
+        with pytest.raises(ReplyError, match="does not answer"):
+            bus.write_goal(1, 0.1)
+        assert emulator.events() == []
+
+
+def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
+    """Catches a supervisor that dies of them with a traceback."""
+    with pytest.raises(ConfigurationError, match=r"different numbers .* got \[1, 1\]"):
+        SupervisedBus({"/dev/ttyNOTHING": [1, 1]})
 
 
 @pytest.mark.parametrize("how", ["kill", "stop", "interrupt", "kill-supervisor"])

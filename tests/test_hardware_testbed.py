@@ -2,9 +2,11 @@
 
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,11 +19,16 @@ import pytest
 import baselines
 from elastic_env.entry_points import configure_testbed
 from elastic_env.errors import ConfigurationError
-from elastic_env.hardware.attitude import Attitude, AttitudeError, AttitudeStream, link_angle
+from elastic_env.hardware import plant
+from elastic_env.hardware.attitude import Attitude, AttitudeError, AttitudeStream, SharedSample, link_angle
+from elastic_env.hardware.bus import States
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import HardwareError, PortError
 from elastic_env.hardware.settings import HardwareSettings
+from elastic_env.hardware.supervised import Cycle
+from elastic_env.hardware.torque_line import torque_of_current
+from train import hardware_trials
 from train.cli import main
 from train.hardware import hardware_arguments
 from train.identify import IdentifyConfig, identified_environments
@@ -145,6 +152,112 @@ def test_the_imus_stream_is_read_and_its_damaged_packets_are_not(emulator: Runni
     assert np.abs(np.array(rolls) - emulator.state()["q"][0]).max() < 0.01  # offset and noise of the scenario
     with pytest.raises(PortError, match="/dev/ttyNOTHING: there is no such device"):
         AttitudeStream("/dev/ttyNOTHING")
+
+
+def test_a_sample_whose_writer_died_within_is_none() -> None:
+    """Catches a control loop that waits for ever, under torque, for the second half of a sample."""
+    file = SharedSample.file()
+    writer, reader = SharedSample(file), SharedSample(file)
+    os.close(file)
+    seen: list[Attitude | None] = []
+    sample = Attitude(1.0, 0.1, 0.2, 0.3)
+    writer._memory[0] = 1  # odd: a write has begun
+    _within_seconds(lambda: seen.append(reader.get()))
+    writer._memory[0] = 0
+    writer.put(sample)
+    seen.append(reader.get())
+    writer._memory[0] = 3
+    _within_seconds(lambda: seen.append(reader.get()))
+    assert seen == [None, sample, sample]
+
+
+def _within_seconds(function: Any) -> None:
+    thread = threading.Thread(target=function, daemon=True)
+    thread.start()
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+class StillBus:
+    """A servo that stands where it is told to, on a clock that only its bus moves."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.goal = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def disable(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    is_confirmed_off = True
+
+    def enable(self, limits: Any) -> Any:
+        return np.zeros(1)
+
+    def keep(self, goals: Any) -> None:
+        pass
+
+    def stop_keeping(self) -> None:
+        self.now_s += 0.006  # the rest of a cycle
+
+    def exchange(self, goals: Any, at: float) -> Cycle:
+        late_s = max(self.now_s - at, 0.0)
+        self.now_s, self.goal = max(at, self.now_s), float(goals[0])
+        yes, no = np.ones(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
+        states = States(np.array(goals), np.zeros(1), np.full(1, 1.0 + self.goal), yes, no, self.now_s)
+        return Cycle(states, np.array(goals), no, is_held=False, late_s=late_s)
+
+
+@pytest.fixture
+def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
+    bus = StillBus()
+    monkeypatch.setattr(plant, "SupervisedBus", lambda *_: bus)
+    monkeypatch.setattr(plant, "time", bus)
+    monkeypatch.setattr(plant, "prefer_realtime", lambda: None)
+    return bus
+
+
+def make_still() -> Any:
+    given = {"reference": QUICK, "confirm": False, "approach_rad_s": 2.0}
+    return gymnasium.make("elastic_env/HardwareTestbed-v0", disable_env_checker=True, port="still", **given)
+
+
+def test_the_first_step_may_come_any_time_after_the_reset(still: StillBus) -> None:
+    """Catches a period that is counted from the reset: every episode would begin with an overrun that is none."""
+    env = make_still()
+    env.reset()
+    still.now_s += 2.0
+    info = env.step(np.zeros(1, dtype=np.float32))[-1]
+    assert info["overruns"] == 0
+    assert info["period"] == pytest.approx(0.004)
+    env.close()
+
+
+def test_the_last_step_tells_of_itself_and_not_of_the_way_back(still: StillBus) -> None:
+    """Catches torque and timing that are measured when the pendulum has been brought back to rest."""
+    env = make_still()
+    env.reset()
+    torques, is_over = [], False
+    while not is_over:
+        *_, is_over, info = env.step(np.full(1, 0.2, dtype=np.float32))
+        torques.append(info["joint_torque"])
+    assert still.goal == 0.0
+    assert info["period"] == pytest.approx(0.004)
+    assert torques[-1] == pytest.approx(torques[-2], abs=0.1)
+    assert torques[-1] == pytest.approx(torque_of_current(1.0 + info["reference_angle"] + 0.2))
+
+
+def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a traceback that ends all other measurements with it."""
+    monkeypatch.setattr(hardware_trials, "_end_once", lambda *_: None)
+    trial = hardware_trials.killed(0.02)
+    assert not trial.is_met
+    assert "all 2 tries had stopped" in trial.measured
 
 
 def test_mounting_turns_angles_into_the_joints() -> None:

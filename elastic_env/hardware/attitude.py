@@ -21,6 +21,7 @@ from elastic_env.hardware.port_lock import lock_port
 _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")
 _SIZE = _COUNTER.size + _SAMPLE.size
+_TRIES = 100
 
 Axis = Literal["roll", "pitch", "yaw"]
 
@@ -48,6 +49,7 @@ class SharedSample:
 
     def __init__(self, descriptor: int) -> None:
         self._memory = mmap.mmap(descriptor, _SIZE)
+        self._last: Attitude | None = None
 
     @staticmethod
     def file() -> int:
@@ -64,13 +66,18 @@ class SharedSample:
         _COUNTER.pack_into(self._memory, 0, counter + 2)
 
     def get(self) -> Attitude | None:
-        """The newest sample; None before the first."""
-        while True:
+        """The newest sample; None before the first.
+
+        Where a write does not come to its end, because its process died or waits, it is the one before.
+        """
+        for _ in range(_TRIES):
             (before,) = _COUNTER.unpack_from(self._memory)
             values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
             (after,) = _COUNTER.unpack_from(self._memory)
             if before == after and before % 2 == 0:
-                return Attitude(*values) if before else None
+                self._last = Attitude(*values) if before else None
+                break
+        return self._last
 
 
 class AttitudeStream:

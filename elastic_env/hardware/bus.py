@@ -15,7 +15,7 @@ import numpy as np
 
 from elastic_env.hardware import protocol
 from elastic_env.hardware.control_table import NUM_BLOCKS, ServoModel, servo_model
-from elastic_env.hardware.errors import HardwareError, ReplyError
+from elastic_env.hardware.errors import BusGoneError, HardwareError, ReplyError
 from elastic_env.hardware.port import COMM_SUCCESS, DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
 from elastic_env.signals import Array, BoolArray
 
@@ -126,7 +126,18 @@ class Bus:
             HardwareError: Its model is not known.
         """
         protocol.require_ids(ids)
-        self.models = {servo_id: servo_model(self.ping(servo_id).model_number) for servo_id in ids}
+        self.attach_known({servo_id: self.ping(servo_id).model_number for servo_id in ids})
+
+    def attach_known(self, numbers: Mapping[int, int]) -> None:
+        """Take servos into the cycle without asking them anything.
+
+        Args:
+            numbers: Model numbers by id.
+
+        Raises:
+            HardwareError: A model is not known, or they do not go together.
+        """
+        self.models = {servo_id: servo_model(number) for servo_id, number in numbers.items()}
         if len({model.blocks for model in self.models.values()}) > 1:
             names = ", ".join(f"{servo_id}: {model.name}" for servo_id, model in self.models.items())
             raise HardwareError(f"the servos of one bus must have one control table, at {self.name} are {names}")
@@ -155,6 +166,18 @@ class Bus:
         """Present position of one servo [rad]."""
         return self.read(servo_id, "present_position") * self.models[servo_id].position_unit
 
+    def velocity(self, servo_id: int) -> float:
+        """Present velocity of one servo [rad/s]."""
+        return self.read(servo_id, "present_velocity") * self.models[servo_id].velocity_unit
+
+    def write_goal(self, servo_id: int, angle: float) -> None:
+        """Command one servo [rad], which confirms it.
+
+        Raises:
+            ReplyError: As `write`.
+        """
+        self.write(servo_id, "goal_position", round(angle / self.models[servo_id].position_unit))
+
     def write_all(self, name: str, values: Mapping[int, int]) -> None:
         """Write a register of several servos in one packet, which nobody confirms.
 
@@ -180,13 +203,14 @@ class Bus:
         self.write_all("goal_position", dict(zip(self.ids, counts, strict=True)))
 
     def torque_off(self) -> None:
-        """Switch all torque off in one packet; also after a read that was interrupted.
+        """Switch all torque off; also after a read that was interrupted.
 
         Raises:
             BusGoneError: The port is gone.
         """
-        self.port.release()
-        self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
+        for _ in range(2):  # nobody confirms a packet to all; a second one costs nothing
+            self.port.release()
+            self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
 
     def confirm_torque_off(self) -> list[str]:
         """Servos that do not say that their torque is off, after some tries each."""
@@ -246,20 +270,25 @@ class Bus:
 
     def _asked(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
         """The data of a reply; a few tries, with silence in between so that no late reply answers the next one."""
+        problem = "does not answer"
         for _ in range(_TRIES):
             self._send(servo_id, instruction, parameters)
             self.port.setPacketTimeout(11 + length)
             while (reply := self._receive()) is not None:
-                answered, error, data = reply
-                reason = protocol.STATUS_ERRORS.get(error & ~protocol.ALERT)
-                if answered == servo_id and reason is not None:
+                answered, status, data = reply
+                error = status & ~protocol.ALERT
+                if answered == servo_id and error == protocol.CRC_ERROR:  # it has done nothing: worth another try
+                    problem = f"says that {protocol.STATUS_ERRORS[error]}"
+                    break
+                if answered == servo_id and error:
+                    reason = protocol.STATUS_ERRORS.get(error, f"error {error}, which the protocol does not have")
                     raise ReplyError(f"servo {servo_id} at {self.name} refuses: {reason}")
                 if answered == servo_id and len(data) == length:
                     return data
             self._wait_for_silence()
             self.num_retries += 1
         raise ReplyError(
-            f"servo {servo_id} at {self.name} does not answer in {_TRIES} tries ({self.port.baudrate} bit/s); check "
+            f"servo {servo_id} at {self.name} {problem} in {_TRIES} tries ({self.port.baudrate} bit/s); check "
             "power, wiring, id and baud rate, see: elastic hardware scan"
         )
 
@@ -308,6 +337,11 @@ class Buses:
         """How messages call the servos of all of them."""
         return [name for bus in self.buses for name in bus.names]
 
+    @property
+    def servos(self) -> list[tuple[Bus, int]]:
+        """Bus and id of each servo."""
+        return [(bus, servo_id) for bus in self.buses for servo_id in bus.ids]
+
     def write_goals(self, angles: Array) -> None:
         """Command all servos, (n,) [rad]."""
         ends = np.cumsum([len(bus.ids) for bus in self.buses])[:-1]
@@ -320,17 +354,29 @@ class Buses:
         joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
         return States(*joined, time_s=max(part.time_s for part in parts))
 
-    def torque_off(self) -> None:
-        """Switch all torque off; a bus that is gone does not keep the others from it.
+    def let_go(self, when_sent: Callable[[], None] = lambda: None) -> HardwareError | None:
+        """Switch all torque off, at every bus before any servo is asked whether it is; a lost bus keeps no other on.
 
-        Raises:
-            BusGoneError: A bus is gone; all others are off.
+        Args:
+            when_sent: Called in between; servos that do not answer make the rest last.
+
+        Returns:
+            What is not certain: a `BusGoneError` where a bus is gone, else a `ReplyError`; None if all is off.
         """
-        self._on_each(lambda bus, _: bus.torque_off())
-
-    def confirm_torque_off(self) -> list[str]:
-        """Servos that do not say that their torque is off."""
-        return [name for names in self._on_each(lambda bus, _: bus.confirm_torque_off()) for name in names]
+        self._on_each(lambda bus, _: _error_of(bus.torque_off))
+        when_sent()
+        found = self._on_each(lambda bus, _: _unconfirmed(bus))
+        errors = [one for one in found if isinstance(one, HardwareError)]
+        silent = [name for one in found if isinstance(one, list) for name in one]
+        said = [str(error) for error in errors]
+        if silent:
+            said.append(f"torque off was sent, but not confirmed by {', '.join(silent)}: switch the power off")
+        if not said:
+            return None
+        off = [bus.name for bus, one in zip(self.buses, found, strict=True) if one == []]
+        said += [f"torque is off at {', '.join(off)}"] if off else []
+        is_gone = any(isinstance(error, BusGoneError) for error in errors)
+        return (BusGoneError if is_gone else ReplyError)("; ".join(said))
 
     def close(self) -> None:
         """Give all ports back."""
@@ -351,3 +397,20 @@ class Buses:
         finally:
             wait(waiting)
         return [first, *(future.result() for future in waiting)]
+
+
+def _error_of(function: Callable[[], None]) -> HardwareError | None:
+    """What a call raises, if anything."""
+    try:
+        function()
+    except HardwareError as error:
+        return error
+    return None
+
+
+def _unconfirmed(bus: Bus) -> list[str] | HardwareError:
+    """Servos that do not say that their torque is off, or why nobody can be asked."""
+    try:
+        return bus.confirm_torque_off()
+    except HardwareError as error:
+        return error

@@ -75,6 +75,7 @@ class ServoPlant:
         self._imu: AttitudeStream | None = None
         self._is_agreed = not settings.confirm
         self._goal = self._due_s = self._read_s = 0.0
+        self._is_kept = False
 
     def begin(self, angle: float) -> None:
         """Torque on, slowly to an angle, and wait there.
@@ -95,10 +96,15 @@ class ServoPlant:
             self._cycles(angle, _SETTLE_S)
             self.timing = Timing()
             bus.keep(self._servo_goal(angle))
+            self._is_kept = True
 
     def advance(self, num_substeps: int) -> None:  # noqa: ARG002  one period, whatever the physics would make of it
         """Command `ctrl`, wait for the end of the control period, read."""
         with self._or_closed():
+            if self._is_kept:  # the first step may come any time after the reset
+                self._opened().stop_keeping()
+                self._restart_clock()
+                self._is_kept = False
             self._cycle(float(self.ctrl[0, 0]))
 
     def finish(self) -> None:

@@ -1,4 +1,9 @@
-"""One program per serial port: the lock that everything that opens one takes first, before it touches the line."""
+"""One program per serial port: the lock that everything that opens one takes first, before it touches the line.
+
+It is an advisory lock (flock): programs that take none are not refused. The stronger mark TIOCEXCL would refuse them,
+but it outlives a program that is killed while any other has the port open, and then keeps out the one that is to
+switch torque off.
+"""
 
 import errno
 import fcntl

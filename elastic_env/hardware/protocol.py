@@ -128,15 +128,17 @@ class Parser:
             if not 3 <= length <= _LONGEST:
                 del self._bytes[: len(HEADER)]
                 continue
-            # a header within the packet is impossible, it would be stuffed: the rest of this one was lost
-            again = self._bytes.find(HEADER, len(HEADER), 7 + length)
-            if again > 0:
+            raw = bytes(self._bytes[: 7 + length])
+            is_whole = len(raw) == 7 + length
+            is_intact = is_whole and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
+            # in what is stuffed no header occurs, with the checksum behind it one may: only where the packet is not
+            # intact does a header before its end mean that the rest was lost
+            again = self._bytes.find(HEADER, len(HEADER))
+            if not is_intact and 0 < again < 7 + length:
                 del self._bytes[:again]
                 continue
-            if len(self._bytes) < 7 + length:
+            if not is_whole:
                 return None
-            raw = bytes(self._bytes[: 7 + length])
             del self._bytes[: 7 + length]
             body = unstuff(raw[7:-2])
-            is_intact = crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
             return Packet(raw[4], body[0], body[1:], is_intact)

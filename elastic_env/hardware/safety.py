@@ -97,7 +97,8 @@ class Guard:
         limits = self.limits
         self._missed = np.where(states.is_fresh, 0, self._missed + 1)
         torque = np.abs(torque_of_current(states.current))
-        self._strained = np.where(states.is_fresh & (torque > limits.torque_nm), self._strained + 1, 0)
+        strained = np.where(torque > limits.torque_nm, self._strained + 1, 0)
+        self._strained = np.where(states.is_fresh, strained, self._strained)  # a missing reply tells neither way
         if states.has_alert.any():
             return "a servo reports a hardware error"
         lost = self._missed >= limits.patience_cycles
@@ -121,9 +122,9 @@ class Guard:
                 f"a servo is further than {limits.following_error_rad:g} rad from its goal, blocked or overloaded: "
                 f"{self._which(behind, states.position)}, goal {np.round(self.goals[behind], 3).tolist()} rad"
             )
-        strained = self._strained >= limits.patience_cycles
-        if strained.any():
-            return f"the torque exceeds {limits.torque_nm:g} N·m: {self._which(strained, torque)} N·m"
+        too_long = states.is_fresh & (self._strained >= limits.patience_cycles)
+        if too_long.any():
+            return f"the torque exceeds {limits.torque_nm:g} N·m: {self._which(too_long, torque)} N·m"
         return ""
 
     def _which(self, are: BoolArray, values: Array | None = None) -> str:

@@ -5,21 +5,28 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware.bus import Bus, States
+from elastic_env.hardware.bus import Bus, Buses, States
 from elastic_env.hardware.channel import Channel
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
 from elastic_env.hardware.port import DEFAULT_BAUDRATE
+from elastic_env.hardware.protocol import require_ids
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.signals import Array, BoolArray
 
 _ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
 _KEEP_ALIVE_S = 0.008
+_ANSWER_S = 0.1
+"""Longest silence of a supervisor beyond what was asked for [s]; then it is taken for dead, and torque switched off."""
+_READ_S = 0.05
+_SLOW_S = 5.0
+_SLOW_PER_SERVO_S = 1.0
+_START_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -49,12 +56,18 @@ class SupervisedBus:
 
     Raises:
         PortError: A port cannot be had.
+        ConfigurationError: Ids that no servo can have, or one twice.
         ReplyError: A servo does not answer.
         HardwareError: Its model is not known, or something is set such that nothing may move.
     """
 
     def __init__(self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> None:
+        for ids in ports.values():
+            require_ids(ids)
         self._ports, self._baudrate = {port: list(ids) for port, ids in ports.items()}, baudrate
+        # confirmations and checks, several tries for each servo that does not answer
+        self._slow_s = _SLOW_S + _SLOW_PER_SERVO_S * sum(map(len, self._ports.values()))
+        self.models: list[list[int]] = []
         own, other = Channel.pair()
         with other:
             self._process = subprocess.Popen(
@@ -69,8 +82,8 @@ class SupervisedBus:
         self._keeper: threading.Thread | None = None
         self._is_kept = threading.Event()
         try:
-            self._hear(0)
-            self.models: list[list[int]] = self._ask("attach", ids=list(self._ports.values()))["models"]
+            self._hear(0, _START_S)
+            self.models = self._ask("attach", self._slow_s, ids=list(self._ports.values()))["models"]
         except BaseException:
             self.close()
             raise
@@ -87,10 +100,12 @@ class SupervisedBus:
             Their positions, (n,) [rad].
 
         Raises:
-            FaultError: A servo reports a hardware error, or stands outside the limits.
+            FaultError: A servo reports a hardware error, moves, or stands outside the limits.
+            ReplyError: A servo does not answer, or does not take the goal where it stands.
+            BusGoneError: The port is gone.
         """
         self._is_enabled, self.is_confirmed_off = True, False
-        answer = self._ask("enable", limits=(limits or SafetyLimits()).model_dump())
+        answer = self._ask("enable", self._slow_s, limits=(limits or SafetyLimits()).model_dump())
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
@@ -106,7 +121,7 @@ class SupervisedBus:
         """
         self.stop_keeping()
         try:
-            answer = self._ask("exchange", goals=np.asarray(goals, dtype=np.float64).tolist(), at=at)
+            answer = self._exchanged(np.asarray(goals, dtype=np.float64), at)
         except HardwareError:
             self._is_enabled = False  # the message says what became of torque
             raise
@@ -120,7 +135,7 @@ class SupervisedBus:
 
     def read(self) -> States:
         """States without a command."""
-        return _states(self._ask("read"))
+        return _states(self._ask("read", _READ_S + _ANSWER_S))
 
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
         """Hold goals from a thread until the next cycle, for at most a time: between moving and stepping.
@@ -142,7 +157,10 @@ class SupervisedBus:
     def _keep(self, goals: Array, end_s: float) -> None:
         with contextlib.suppress(HardwareError):
             while self._is_kept.is_set() and time.monotonic() < end_s:
-                self._ask("exchange", goals=goals.tolist(), at=time.monotonic() + _KEEP_ALIVE_S)
+                self._exchanged(goals, time.monotonic() + _KEEP_ALIVE_S)
+
+    def _exchanged(self, goals: Array, at: float) -> dict[str, Any]:
+        return self._ask("exchange", max(at - time.monotonic(), 0.0) + _ANSWER_S, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Torque off.
@@ -153,7 +171,7 @@ class SupervisedBus:
         """
         self.stop_keeping()
         self._is_enabled = self.is_confirmed_off = False
-        self._ask("disable")
+        self._ask("disable", _ANSWER_S)
         self.is_confirmed_off = True
 
     def close(self) -> None:
@@ -183,49 +201,96 @@ class SupervisedBus:
     def _let_go(self) -> None:
         """Torque off after an interrupted cycle, whatever its answer would have been."""
         with contextlib.suppress(HardwareError, OSError):
-            self._ask("disable")
+            self._ask("disable", _ANSWER_S)
 
-    def _ask(self, action: str, **arguments: Any) -> dict[str, Any]:
+    def _ask(self, action: str, within_s: float, **arguments: Any) -> dict[str, Any]:
+        """The answer to a request, which must come within a time [s]."""
         with self._lock:
             self._number += 1
             try:
                 self._channel.send({"number": self._number, "do": action, "with": arguments})
             except OSError:
                 raise self._without_supervisor() from None
-            return self._hear(self._number)
+            return self._hear(self._number, within_s)
 
-    def _hear(self, number: int) -> dict[str, Any]:
+    def _hear(self, number: int, within_s: float) -> dict[str, Any]:
         """The answer of a number; those of requests that were interrupted are passed over."""
-        while (answer := self._channel.receive()) is not None:
-            if answer["number"] == number:
-                if "error" in answer:
-                    raise _ERRORS[answer["error"]](answer["message"])
+        end_s = time.monotonic() + within_s
+        while self._channel.is_waiting(max(end_s - time.monotonic(), 0.0)):
+            answer = self._channel.receive()
+            if answer is None:
+                raise self._without_supervisor()
+            if answer["number"] != number:
+                continue
+            if "error" in answer:
+                raise _ERRORS[answer["error"]](answer["message"])
+            if "busy" not in answer:
                 return answer
-        raise self._without_supervisor()
+            within_s = self._slow_s  # torque off is sent, its confirmation may take
+            end_s = time.monotonic() + within_s
+        self._process.kill()
+        raise self._without_supervisor(within_s)
 
-    def _without_supervisor(self) -> FaultError:
-        """The supervisor died: switch torque off in its place."""
+    def _without_supervisor(self, silent_s: float | None = None) -> FaultError:
+        """The supervisor died, or was silent for a time [s] and had to: switch torque off in its place."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
-        code = self._process.poll()
-        said = emergency_stop(self._ports, self._baudrate)
-        return FaultError(f"the supervisor process ended (exit code {code}); {said}")
+        how = f"ended (exit code {self._process.poll()})"
+        if silent_s is not None:
+            how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
+        return FaultError(f"the supervisor process {how}; {emergency_stop(self._ports, self._baudrate, self.models)}")
 
 
-def emergency_stop(ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> str:
-    """Switch torque off without a supervisor; what came of it, in words."""
-    said = []
-    for port, ids in ports.items():
-        try:
-            with Bus(port, baudrate) as bus:
-                bus.attach(ids)
-                bus.torque_off()
-                unconfirmed = bus.confirm_torque_off()
-        except HardwareError as error:
-            said.append(f"torque could not be switched off: {error}")
-        else:
-            said.append(f"torque off not confirmed by {', '.join(unconfirmed)}" if unconfirmed else "torque is off")
+def emergency_stop(
+    ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE, models: Sequence[Sequence[int]] = ()
+) -> str:
+    """Switch torque off without a supervisor.
+
+    Args:
+        ports: Ids of the servos by port.
+        baudrate: Bits per second.
+        models: Their model numbers, in that order; where they are not given each servo is asked for its own first.
+
+    Returns:
+        What came of it, in words.
+    """
+    said: list[str] = []
+    buses: list[Bus] = []
+    with contextlib.ExitStack() as opened:
+        for number, (port, ids) in enumerate(ports.items()):
+            bus = Bus(port, baudrate)
+            try:
+                bus.open()
+                opened.enter_context(_closed(bus))
+                bus.attach_known(dict(zip(ids, models[number], strict=True)) if models else _models(bus, ids, said))
+                buses.append(bus)
+            except HardwareError as error:
+                said.append(f"torque could not be switched off: {error}")
+        problem = Buses(buses).let_go() if buses else None
+    if problem is not None:
+        said.append(str(problem))
+    elif any(bus.models for bus in buses):
+        said.append("torque of the others is off" if said else "torque is off")
     return "; ".join(dict.fromkeys(said))
+
+
+@contextlib.contextmanager
+def _closed(bus: Bus) -> Iterator[None]:
+    """Close a bus at the end; one that is gone cannot be, which has been said before."""
+    yield
+    with contextlib.suppress(HardwareError):
+        bus.close()
+
+
+def _models(bus: Bus, ids: Sequence[int], said: list[str]) -> dict[int, int]:
+    """Model numbers of the servos that answer, by id; of the others is said that they do not."""
+    models = {}
+    for servo_id in ids:
+        try:
+            models[servo_id] = bus.ping(servo_id).model_number
+        except ReplyError as error:
+            said.append(f"torque could not be switched off: {error}")
+    return models
 
 
 def _states(answer: dict[str, Any]) -> States:

@@ -6,9 +6,10 @@ torque is off. Torque goes off when
 * the program ends, however it ends: its end of the channel closes;
 * no command comes for `SafetyLimits.hang_s`: the program hangs;
 * the `Guard` finds a reason in what is measured;
-* it is itself asked to end (SIGTERM, SIGHUP, SIGINT), also during a read.
+* it is itself asked to end (SIGTERM, SIGHUP, SIGINT), also during a read, also more than once.
 """
 
+import contextlib
 import signal
 import socket
 import sys
@@ -22,7 +23,7 @@ from elastic_env.hardware.bus import Bus, Buses, States
 from elastic_env.hardware.channel import Channel
 from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.control_table import explain_errors
-from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, ReplyError
+from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.realtime import prefer_realtime, sleep_until
 from elastic_env.hardware.safety import Guard, SafetyLimits
 
@@ -30,6 +31,8 @@ _LONGEST_WAIT_S = 0.02
 _REPLY_TIMEOUT_S = 0.003
 _WATCHDOG_COUNTS = 3  # of 20 ms
 _WATCHDOG_CLEAR = 0
+_REST_RAD_S = 0.2
+"""Speed below which a servo counts as at rest [rad/s]; one that gets its torque in motion is stopped with a jerk."""
 
 
 class Supervisor:
@@ -45,25 +48,43 @@ class Supervisor:
         self._bus = Buses(buses)
         self._guard: Guard | None = None
         self._commanded_s = 0.0
-        self._fault = ""
+        self._served_s = 0.0
+        self._number = 0
+        self._fault: HardwareError | None = None
 
     def run(self) -> None:
         """Serve until the program is gone; then torque is off."""
         try:
             while (request := self._next()) is not None:
-                self._channel.send({"number": request["number"], **self._answer(request)})
+                self._number = request["number"]
+                self._channel.send({"number": self._number, **self._answer(request)})
         except OSError:
             pass  # the program is gone
         finally:
-            self._let_go()
+            try:
+                self._let_go()
+            except BaseException:  # a signal in this very moment; after it no other comes through
+                self._let_go()
+                raise
 
     def _next(self) -> dict[str, Any] | None:
         """The next request; a program that hangs loses its torque meanwhile."""
-        while True:
-            limit = None if self._guard is None else self._guard.limits.hang_s
-            if self._channel.is_waiting(limit):
-                return self._channel.receive()
-            self._stop(f"no command for {1e3 * (limit or 0.0):.0f} ms: the program hangs")
+        while not self._channel.is_waiting(self._patience_s()):
+            self._stop_hanging()
+        request = self._channel.receive()
+        if request is not None and request["do"] == "read" and self._patience_s() == 0.0:
+            self._stop_hanging()  # reading is not commanding
+        return request
+
+    def _patience_s(self) -> float | None:
+        """How long a command may still be waited for [s]; None while nothing moves."""
+        if self._guard is None:
+            return None
+        return max(self._served_s + self._guard.limits.hang_s - time.monotonic(), 0.0)
+
+    def _stop_hanging(self) -> None:
+        limit_s = 0.0 if self._guard is None else self._guard.limits.hang_s
+        self._stop(f"no command for {1e3 * limit_s:.0f} ms: the program hangs")
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
         actions: dict[str, Callable[..., dict[str, Any]]] = {
@@ -72,14 +93,9 @@ class Supervisor:
         }  # fmt: skip
         try:
             return actions[request["do"]](**request["with"])
-        except BusGoneError as error:
-            self._let_go()  # at the other buses, if there are any
-            return {"error": "BusGoneError", "message": str(error)}
         except HardwareError as error:
-            if self._guard is not None:  # torque is still on
-                self._stop(str(error))
-                return {"error": "FaultError", "message": self._fault}
-            return {"error": type(error).__name__, "message": str(error)}
+            said = error if self._guard is None else self._stop(str(error))  # torque is still on
+            return {"error": type(said).__name__, "message": str(said)}
 
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
         for bus, own in zip(self._bus.buses, ids, strict=True):
@@ -91,16 +107,19 @@ class Supervisor:
 
     def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
         """Torque on, with every servo's goal where it stands."""
+        if isinstance(self._fault, BusGoneError):
+            raise self._fault.with_traceback(None)  # for good: what is plugged in again is another port
         self._disable()
-        for bus in self._bus.buses:
-            for servo_id in bus.ids:
-                self._require_healthy(bus, servo_id)
-        measured = np.array([bus.position(servo_id) for bus in self._bus.buses for servo_id in bus.ids])
+        for bus, servo_id in self._bus.servos:
+            _require_healthy(bus, servo_id)
+            _require_rest(bus, servo_id)
+        measured = np.array([bus.position(servo_id) for bus, servo_id in self._bus.servos])
         guard = Guard(SafetyLimits(**limits), measured, self._bus.names)
-        self._fault = ""
+        self._fault = None
         try:
             self._write("bus_watchdog", _WATCHDOG_CLEAR)
-            self._bus.write_goals(measured)
+            for (bus, servo_id), angle in zip(self._bus.servos, measured.tolist(), strict=True):
+                bus.write_goal(servo_id, angle)  # confirmed: with torque, a servo may run to the goal it has
             self._write("torque_enable", 1)
             self._bus.write_goals(measured)
             self._write("bus_watchdog", _WATCHDOG_COUNTS)
@@ -108,16 +127,16 @@ class Supervisor:
             self._let_go()
             raise
         self._guard, self._commanded_s = guard, time.monotonic()
+        self._served_s = self._commanded_s
         for bus in self._bus.buses:
             bus.port.reply_timeout_s = _REPLY_TIMEOUT_S
         return {"position": measured.tolist()}
 
     def _write(self, name: str, value: int) -> None:
         """Write a register of every servo that has it, each with its confirmation."""
-        for bus in self._bus.buses:
-            for servo_id, model in bus.models.items():
-                if name in model.table:
-                    bus.write(servo_id, name, value)
+        for bus, servo_id in self._bus.servos:
+            if name in bus.models[servo_id].table:
+                bus.write(servo_id, name, value)
 
     def _exchange(self, goals: list[float], at: float) -> dict[str, Any]:
         """Command, wait for a moment, read; the moment is on the monotonic clock, which both processes share."""
@@ -134,8 +153,9 @@ class Supervisor:
         states = self._bus.read_states(_REPLY_TIMEOUT_S)
         reason = guard.take(states)
         if reason:
-            self._stop(reason)
-            raise FaultError(self._fault + self._alerts(states))
+            fault = self._stop(reason)
+            raise type(fault)(f"{fault}{self._alerts(states)}")
+        self._served_s = time.monotonic()
         return {
             **_plain(states), "goals": allowed.tolist(), "limited": is_limited.tolist(), "held": was_holding,
             "late_s": begin - at,
@@ -147,59 +167,71 @@ class Supervisor:
 
     def _disable(self) -> dict[str, Any]:
         """Torque off, confirmed."""
-        self._guard = None
-        said = self._let_go()
-        if said:
-            raise ReplyError(said)
+        problem = self._let_go()
+        if problem is not None:
+            raise problem
         return {}
 
     def _require_motion(self) -> Guard:
-        if self._guard is None:
-            raise FaultError(self._fault or "torque is off; it must be enabled first")
-        return self._guard
-
-    def _require_healthy(self, bus: Bus, servo_id: int) -> None:
-        status = bus.read(servo_id, "hardware_error_status")
-        if status:
-            raise FaultError(
-                f"servo {servo_id} at {bus.name} reports {explain_errors(status) or f'error {status}'}; remove the "
-                "cause, then switch its power off and on"
-            )
+        if self._guard is not None:
+            return self._guard
+        if self._fault is not None:
+            raise self._fault.with_traceback(None)
+        raise FaultError("torque is off; it must be enabled first")
 
     def _alerts(self, states: States) -> str:
         """What the servos that raised the alert bit say is wrong."""
         if not states.has_alert.any():
             return ""
-        said, column = [], 0
-        for bus in self._bus.buses:
-            for servo_id in bus.ids:
-                if states.has_alert[column]:
-                    try:
-                        status = bus.read(servo_id, "hardware_error_status")
-                        said.append(f"servo {servo_id} at {bus.name}: {explain_errors(status) or f'error {status}'}")
-                    except ReplyError as error:
-                        said.append(str(error))
-                column += 1
+        said = []
+        for (bus, servo_id), has_alert in zip(self._bus.servos, states.has_alert.tolist(), strict=True):
+            if has_alert:
+                try:
+                    said.append(f"servo {servo_id} at {bus.name}: {_hardware_error(bus, servo_id)}")
+                except HardwareError as error:
+                    said.append(str(error))
         return f" ({'; '.join(said)})"
 
-    def _stop(self, reason: str) -> None:
-        """End the motion for a reason, which the program hears with its next request."""
-        self._guard = None
-        said = self._let_go()
-        self._fault = f"{reason}; {said or 'torque is off'}"
+    def _stop(self, reason: str) -> HardwareError:
+        """End the motion for a reason: the error that answers every request for motion from now on."""
+        problem = self._let_go()
+        said = "torque is off" if problem is None else str(problem)
+        kind = BusGoneError if isinstance(problem, BusGoneError) else FaultError
+        self._fault = kind(said if reason in said else f"{reason}; {said}")
+        return self._fault
 
-    def _let_go(self) -> str:
-        """Torque off at once, then confirmed; what is not certain about it, "" if nothing."""
+    def _let_go(self) -> HardwareError | None:
+        """Torque off at once, then confirmed; what is not certain about it."""
         self._guard = None
-        try:
-            self._bus.torque_off()
-            self._bus.torque_off()  # nobody confirms a packet to all; a second one costs nothing
-            unconfirmed = self._bus.confirm_torque_off()
-        except HardwareError as error:
-            return str(error)
-        if unconfirmed:
-            return f"torque off was sent, but not confirmed by {', '.join(unconfirmed)}: switch the power off"
-        return ""
+        return self._bus.let_go(self._say_busy)
+
+    def _say_busy(self) -> None:
+        """Tell the program, which takes a supervisor that is silent for dead, that torque off takes its time."""
+        with contextlib.suppress(OSError):
+            self._channel.send({"number": self._number, "busy": True})
+
+
+def _hardware_error(bus: Bus, servo_id: int) -> str:
+    """What a servo says is wrong, "" if nothing."""
+    status = bus.read(servo_id, "hardware_error_status")
+    return (explain_errors(status) or f"error {status}") if status else ""
+
+
+def _require_healthy(bus: Bus, servo_id: int) -> None:
+    error = _hardware_error(bus, servo_id)
+    if error:
+        raise FaultError(
+            f"servo {servo_id} at {bus.name} reports {error}; remove the cause, then switch its power off and on"
+        )
+
+
+def _require_rest(bus: Bus, servo_id: int) -> None:
+    speed = abs(bus.velocity(servo_id))
+    if speed > _REST_RAD_S:
+        raise FaultError(
+            f"servo {servo_id} at {bus.name} moves at {speed:.2f} rad/s; torque goes on at rest, below {_REST_RAD_S:g} "
+            "rad/s: wait until it hangs still, then try again"
+        )
 
 
 def _plain(states: States) -> dict[str, Any]:
@@ -209,13 +241,23 @@ def _plain(states: States) -> dict[str, Any]:
     }  # fmt: skip
 
 
+_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+
+
 def _end(signal_number: int, _: Any) -> None:
+    """End by an exception, once: signals that come on the way out must not keep torque off from being sent."""
+    for number in _SIGNALS:
+        signal.signal(number, _ignore)
     raise SystemExit(128 + signal_number)
+
+
+def _ignore(signal_number: int, _: Any) -> None:
+    """In the place of SIG_IGN, with which Python would complain of a signal that had come just before."""
 
 
 def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     """Open the ports, say how that went, and serve."""
-    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+    for number in _SIGNALS:
         signal.signal(number, _end)
     prefer_realtime()
     buses = [Bus(port, baudrate) for port in ports]

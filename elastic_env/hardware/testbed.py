@@ -62,6 +62,7 @@ class HardwareTestbedTask(TestbedTask):
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         super().__init__(config, num_worlds=1)
         self.plant = ServoPlant(self.model, self._at, settings, config.control_period_s, config.pendulum.gravity_torque)
+        self._read_plant()
         extent, limits = config.reference.extent(), settings.limits
         if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
             raise HardwareError(
@@ -78,22 +79,23 @@ class HardwareTestbedTask(TestbedTask):
         self._command = self._reference.at(self._step).q.copy()
         self.plant.begin(float(self._command[0]))
         self._read(simulation, worlds)
+        self._read_plant()
         at_rest = Measurement(self._theta, self._theta, self._q)
         self._measured = self._shown = at_rest
 
     def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
         """Take the new measurements; behind the last step the pendulum is brought to rest."""
         super().sense(simulation, healthy)
+        self._read_plant()  # before the way back to rest, which measures too
         if self.finished().all():
             self.plant.finish()
 
     def sample(self) -> HardwareSample:
         """See `TestbedTask`."""
-        measured = super().sample()
-        timing = self.plant.timing
+        measured, timing = super().sample(), self._timing
         return HardwareSample(
             *(getattr(measured, field.name) for field in fields(TestbedSample)),
-            motor_torque=self.plant.motor_torque.copy(),
+            motor_torque=self._motor_torque.copy(),
             jitter_s=np.array([timing.jitter_s]),
             period_s=np.array([timing.period_s]),
             overruns=np.array([timing.overruns]),
@@ -121,6 +123,9 @@ class HardwareTestbedTask(TestbedTask):
             HardwareError: Always.
         """
         raise HardwareError("hardware has no truth: the policy 'oracle' and scores by the true link need a simulation")
+
+    def _read_plant(self) -> None:
+        self._motor_torque, self._timing = self.plant.motor_torque.copy(), self.plant.timing
 
     def _measure(self, worlds: BoolArray) -> Measurement:  # noqa: ARG002  there is one
         """The encoder's change is that of a control period also where a cycle had to be repeated."""

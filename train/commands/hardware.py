@@ -90,6 +90,8 @@ class Emulate:
     """Scenario of the joint and of the IMU, as in elastic identify."""
     stiffness: float | None = None
     """K of the joint [N·m/rad]; default the paper's 1001."""
+    unheard: float = 0.0
+    """Share of instructions that reach no servo."""
     lost: float = 0.0
     """Share of replies that do not come; this and the next three are drawn for every reply, each by itself."""
     late: float = 0.0
@@ -111,7 +113,7 @@ class Emulate:
         from train.hardware import emulate
 
         faults = Faults(
-            lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
+            unheard=self.unheard, lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
             latency_s=1e-3 * self.latency_ms,
         )  # fmt: skip
         config = EmulatorConfig(
@@ -125,7 +127,7 @@ class Emulate:
 class Prove:
     """Measure what driver, limits and supervisor do when things go wrong, against an emulated bus.
 
-    Long: about 25 minutes; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
+    Long: about half an hour; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
     """
 
     share: float = 1.0

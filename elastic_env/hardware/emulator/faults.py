@@ -8,8 +8,9 @@ from elastic_env.config import Model, quantity
 
 
 class Faults(Model):
-    """Faults of an emulated bus; all of them off by default. Shares are drawn per reply."""
+    """Faults of an emulated bus; all of them off by default. Shares are drawn per reply, or per instruction."""
 
+    unheard: float = quantity("1", 0.0, ge=0, le=1, description="share of instructions that reach no servo")
     lost: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that do not come")
     late: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that come late")
     late_s: float = quantity("s", 0.006, ge=0, le=1, description="how late")

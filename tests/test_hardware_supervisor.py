@@ -1,0 +1,278 @@
+"""The supervisor in this process, on emulated servos without terminals: faults at the very moment that matters."""
+
+import itertools
+import signal
+import socket
+from collections import deque
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from elastic_env.hardware import protocol, supervised, supervisor
+from elastic_env.hardware.bus import Bus
+from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.control_table import servo_model
+from elastic_env.hardware.emulator.servo import EmulatedServo, MotorAtRest
+from elastic_env.hardware.emulator.wire import EmulatedBus
+from elastic_env.hardware.errors import BusGoneError, ReplyError
+from elastic_env.hardware.protocol import Packet, Parser
+from elastic_env.hardware.safety import SafetyLimits
+from elastic_env.hardware.supervised import emergency_stop
+from elastic_env.hardware.supervisor import Supervisor
+
+MODEL = servo_model(54024)
+ENABLE = ("enable", {"limits": SafetyLimits().model_dump()})
+READ: tuple[str, dict[str, Any]] = ("read", {})
+
+
+def exchange(*goals: float) -> tuple[str, dict[str, Any]]:
+    return "exchange", {"goals": list(goals), "at": 0.0}
+
+
+class Line(Bus):
+    """A bus whose servos answer at once.
+
+    Attributes:
+        sent: Instructions that were sent, (id, instruction).
+        events: What changed at the servos, (id, register, value).
+        goals_at_torque_on: Where a servo was told to go when it got torque, less where it stood [rad].
+        lost: Numbers of the instructions, as they are sent, that reach no servo.
+        damaged: Likewise those that arrive damaged.
+        silent: Ids of servos that hear but do not answer.
+        gone_at: Instruction from which on the port is gone.
+    """
+
+    def __init__(self, name: str, *ids: int, log: list[tuple[str, int]] | None = None) -> None:
+        super().__init__(name)
+        self.motors = {servo_id: MotorAtRest() for servo_id in ids}
+        self.servos = {i: EmulatedServo(i, MODEL, self._note, None, motor) for i, motor in self.motors.items()}
+        self.sent: list[tuple[int, int]] = []
+        self.log = [] if log is None else log
+        self.events: list[tuple[int, str, int]] = []
+        self.goals_at_torque_on: list[float] = []
+        self.lost: set[int] = set()
+        self.damaged: set[int] = set()
+        self.silent: set[int] = set()
+        self.gone_at = -1
+        self._line = EmulatedBus(list(self.servos.values()))
+        self._is_gone = False
+        self._coming: deque[Packet] = deque()
+
+    def open(self) -> None:
+        pass
+
+    def _note(self, servo_id: int, name: str, value: int) -> None:
+        self.events.append((servo_id, name, value))
+        if (name, value) == ("torque_enable", 1):
+            self.goals_at_torque_on.append(self.servos[servo_id].goal - self.motors[servo_id].position)
+
+    def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+        self._is_gone |= instruction == self.gone_at
+        if self._is_gone:
+            raise BusGoneError(f"the bus at {self.name} is gone: switch their power off")
+        number = len(self.sent)
+        self.sent.append((servo_id, instruction))
+        self.log.append((self.name, instruction))
+        self._coming.clear()
+        if number not in self.lost:
+            packet = Packet(servo_id, instruction, parameters, number not in self.damaged)
+            wire = b"".join(self._line.answer(packet, 0.0))
+            self._coming += [reply for reply in Parser().feed(wire) if reply.servo_id not in self.silent]
+
+    def _receive(self) -> tuple[int, int, bytes] | None:
+        if not self._coming:
+            return None
+        reply = self._coming.popleft()
+        return reply.servo_id, reply.parameters[0], reply.parameters[1:]
+
+    def _wait_for_silence(self) -> None:
+        pass
+
+
+def attached(name: str, *ids: int, log: list[tuple[str, int]] | None = None) -> Line:
+    line = Line(name, *ids, log=log)
+    line.attach(ids)
+    line.sent.clear()
+    line.log.clear()
+    return line
+
+
+def served(lines: list[Line], *requests: tuple[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """What a supervisor answers to requests which all have come before it begins, and then the program is gone."""
+    own, other = Channel.pair()
+    program = Channel(own)
+    for number, (action, arguments) in enumerate(requests, 1):
+        program.send({"number": number, "do": action, "with": arguments})
+    own.shutdown(socket.SHUT_WR)
+    try:
+        Supervisor(Channel(other), list(lines)).run()
+    finally:
+        other.close()
+    answers = iter(program.receive, None)
+    try:
+        return [answer for answer in answers if answer is not None and "busy" not in answer]
+    finally:
+        own.close()
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """The supervisor's handlers of signals, for a test."""
+    before = {number: signal.signal(number, supervisor._end) for number in supervisor._SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+@pytest.mark.usefixtures("handlers")
+def test_signals_in_the_last_moment_do_not_keep_torque_on(number: int) -> None:
+    """Catches torque off that a signal interrupts before it is sent, or a second one that comes with the first."""
+    pending = [signal.SIGTERM, signal.SIGHUP, signal.SIGINT][:number]
+
+    class Interrupted(Line):
+        def torque_off(self) -> None:
+            if pending:
+                signal.raise_signal(pending.pop(0))
+            super().torque_off()
+
+    line = Interrupted("one", 1)
+    line.attach([1])
+    with pytest.raises(SystemExit):
+        served([line])
+    assert (1, "torque_enable", 0) in line.events
+
+
+def test_a_bus_that_is_lost_before_the_first_step_is_remembered() -> None:
+    """Catches "torque is off" as the answer where nobody knows: the first to hear of the loss was the keeper."""
+    line = attached("one", 1)
+    line.gone_at = protocol.SYNC_READ
+    answers = served([line], ENABLE, exchange(0.0), exchange(0.0), ENABLE, ("disable", {}))
+    assert [answer.get("error", "") for answer in answers] == ["", *["BusGoneError"] * 4]
+    assert all("the bus at one is gone" in answer["message"] for answer in answers[1:])
+
+
+def test_a_lost_bus_leaves_the_others_off_and_confirmed() -> None:
+    """Catches a loss that ends the attempt at the others, and a message that tells of one bus only."""
+    lost, left = attached("one", 1), attached("two", 1, 2)
+    lost.gone_at = protocol.SYNC_READ
+    _, answer = served([lost, left], ENABLE, exchange(0.0, 0.0, 0.0))
+    assert answer["error"] == "BusGoneError"
+    assert answer["message"] == "the bus at one is gone: switch their power off; torque is off at two"
+    assert [servo.is_on for servo in left.servos.values()] == [False, False]
+    after = left.sent[left.sent.index((protocol.BROADCAST, protocol.SYNC_READ)) + 1 :]
+    off = (protocol.BROADCAST, protocol.SYNC_WRITE)
+    assert after[:4] == [off, off, (1, protocol.READ), (2, protocol.READ)]
+
+
+def test_no_lost_instruction_lets_a_servo_jump() -> None:
+    """Catches torque that is switched on although the goal before it never arrived: the servo keeps an old one."""
+    for lost in itertools.count():
+        line = attached("one", 1, 2)
+        for motor in line.motors.values():
+            motor.position = 0.3
+        line.lost = {lost}
+        (answer,) = served([line], ENABLE)
+        assert "error" not in answer
+        assert len(line.goals_at_torque_on) == 2
+        assert max(map(abs, line.goals_at_torque_on)) <= MODEL.position_unit
+        if lost >= len(line.sent):
+            break
+
+
+def test_a_goal_that_is_refused_keeps_torque_off() -> None:
+    """Catches torque that is switched on at whatever goal the servo has."""
+    line = attached("one", 1)
+    line.motors[1].position = 0.3
+    line.write(1, "max_position_limit", 1000)
+    (answer,) = served([line], ENABLE)
+    assert "beyond the servo's limit" in answer["message"]
+    assert (1, "torque_enable", 1) not in line.events
+
+
+def test_torque_goes_on_at_rest_only() -> None:
+    """Catches a pendulum that still swings after a fault and is stopped with a jerk."""
+    line = attached("one", 1, 2)
+    line.motors[2].velocity = -0.5
+    (answer,) = served([line], ENABLE)
+    assert answer["error"] == "FaultError"
+    assert "servo 2 at one moves at 0.50 rad/s" in answer["message"]
+    assert (1, "torque_enable", 1) not in line.events
+    line.motors[2].velocity = 0.1
+    (answer,) = served([line], ENABLE)
+    assert "error" not in answer
+
+
+def test_reading_does_not_count_as_commanding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a program that only reads and so keeps torque on for ever, as one that hangs in its control law may."""
+    clock = [0.0]
+    monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+
+    class Slow(Line):
+        def read_states(self, timeout_s: float) -> Any:
+            clock[0] += 0.02
+            return super().read_states(timeout_s)
+
+    line = Slow("one", 1)
+    line.attach([1])
+    *answers, last = served([line], ENABLE, READ, READ, exchange(0.0), READ, READ, READ, READ, exchange(0.0))
+    assert not any("error" in answer for answer in answers)
+    assert last["error"] == "FaultError"
+    assert "no command for 50 ms" in last["message"]
+
+
+def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a stop that asks all servos before it switches any off, or one port after the other."""
+    log: list[tuple[str, int]] = []
+    lines = {"one": attached("one", 1, 2, log=log), "two": attached("two", 3, log=log)}
+    monkeypatch.setattr(supervised, "Bus", lambda port, _: lines[port])
+    ports = {"one": [1, 2], "two": [3]}
+    for line in lines.values():
+        line.write_all("torque_enable", dict.fromkeys(line.ids, 1))
+    log.clear()
+    lines["one"].silent = {2}
+    said = emergency_stop(ports, models=[[54024, 54024], [54024]])
+    assert not any(servo.is_on for line in lines.values() for servo in line.servos.values())
+    assert "not confirmed by servo 2 at one: switch the power off" in said
+    assert "torque is off at two" in said
+    assert {instruction for _, instruction in log[:4]} == {protocol.SYNC_WRITE}
+    assert sorted(name for name, _ in log[:4]) == ["one", "one", "two", "two"]
+
+
+def test_emergency_stop_without_models_takes_those_that_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches one servo without power that keeps all others under torque."""
+    line = attached("one", 1, 2)
+    monkeypatch.setattr(supervised, "Bus", lambda *_: line)
+    line.write_all("torque_enable", {1: 1, 2: 1})
+    line.silent = {1}
+    said = emergency_stop({"one": [1, 2]})
+    assert not line.servos[2].is_on
+    assert "servo 1 at one does not answer" in said
+    assert said.endswith("torque of the others is off")
+
+
+def test_an_instruction_that_arrives_damaged_is_sent_again() -> None:
+    """Catches a bad line that is taken for a refusal, and one that is never given up."""
+    line = attached("one", 1)
+    line.damaged = {0, 1}
+    line.write_goal(1, 0.1)
+    assert line.servos[1].goal == pytest.approx(0.1, abs=MODEL.position_unit)
+    assert line.num_retries == 2
+    line.damaged = {3, 4, 5}
+    with pytest.raises(ReplyError, match=r"servo 1 at one says that the instruction arrived damaged in 3 tries"):
+        line.write_goal(1, 0.2)
+
+
+def test_an_error_number_that_nobody_knows_is_no_success() -> None:
+    """Catches a refusal that passes as done because the protocol's list ends at 7."""
+
+    class Strange(Line):
+        def _receive(self) -> tuple[int, int, bytes] | None:
+            return 1, 9, b""
+
+    line = Strange("one", 1)
+    line.attach_known({1: 54024})
+    with pytest.raises(ReplyError, match="refuses: error 9"):
+        line.write(1, "torque_enable", 0)
