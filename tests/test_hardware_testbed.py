@@ -28,6 +28,7 @@ from elastic_env.hardware.errors import HardwareError, PortError
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle
 from elastic_env.hardware.torque_line import torque_of_current
+from tests.busy import once_more
 from train import hardware_trials
 from train.cli import main
 from train.hardware import hardware_arguments
@@ -37,8 +38,7 @@ QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.
 PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
 """A busy computer delays pseudo-terminals."""
 
-pytestmark = pytest.mark.flaky(reruns=2, only_rerun="no usable reply")
-"""At times it lets no process run for 40 ms: a fault, which rightly ends the motion."""
+pytestmark = once_more
 
 
 @pytest.fixture(scope="module")
@@ -281,6 +281,14 @@ def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> No
     assert [(p.gravity_torque, p.mass) for p in pendulums] == [(52.0, 8.0), (26.0, 4.0)]
 
 
+def command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """Run a command; one that fails says why where `once_more` looks for it."""
+    try:
+        main(arguments)
+    except SystemExit:
+        pytest.fail(capsys.readouterr().err)
+
+
 def test_commands_run_on_hardware(
     emulator: RunningEmulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -295,11 +303,11 @@ def test_commands_run_on_hardware(
     assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5
     assert "pendulum" not in hardware_arguments(emulator.port, None, None, yes=True)  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
-    main(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"])
+    command(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"], capsys)
     (episode,) = csv.DictReader(Path("evaluated/episodes.csv").read_text().splitlines())
     assert episode["scenario"] == "hardware"
     assert 0.0 < float(episode["link_error_imu_rms_rad"]) < 0.05
-    main(["hardware", "run", *reference, *options, "--output", "run"])
+    command(["hardware", "run", *reference, *options, "--output", "run"], capsys)
     rows = list(csv.DictReader(Path("run/log.csv").read_text().splitlines()))
     assert len(rows) == 425
     assert all(float(row["period"]) > 0.0 for row in rows)

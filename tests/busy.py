@@ -1,0 +1,8 @@
+"""Tests on an emulated bus, on a computer that may have other things to do."""
+
+import pytest
+
+once_more = pytest.mark.flaky(
+    reruns=2, only_rerun=["no usable reply", "does not answer in 3 tries", "not confirmed by servo"]
+)
+"""At times it lets no process run for 40 ms or more: replies are missing, which rightly is an error."""
