@@ -33,6 +33,7 @@ class Compensated:
     ) -> None:
         self.policy, self.compensator = policy, compensator
         model = compensator.model
+        self._num_joints = len(model.joint_names)
         self._shows_rates = getattr(policy, "reads_rates", True)
         self._view = ObservationView(model.observation_table, model.control_period_s)
         self._ramp = Ramp(model, ramp_s)
@@ -65,7 +66,7 @@ class Compensated:
             episode_start: As in `predict`.
             deterministic: As in `predict`.
         """
-        rows, n = self._view.rows(observation), len(self.compensator.model.joint_names)
+        rows, n = self._view.rows(observation), self._num_joints
         desired, compensator = self._view.motion(rows), self.compensator.at(rows)
         memory, inner_state = resume(
             state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1 + n, 0)))
@@ -92,8 +93,7 @@ class Compensated:
             state: What `predict` returned for it.
         """
         memory, _ = state
-        n = len(self.compensator.model.joint_names)
-        return memory[:, 1 : 1 + n].reshape((*observation.shape[:-1], n))
+        return memory[:, 1 : 1 + self._num_joints].reshape((*observation.shape[:-1], self._num_joints))
 
     def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
         """The links' angles by the encoders."""

@@ -115,7 +115,10 @@ class HingeTorque:
     def __init__(self, model: RobotModel) -> None:
         names = model.joint_names
         if len(names) != 1:
-            raise ConfigurationError(f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)}")
+            raise ConfigurationError(
+                f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)}; choose pinocchio or "
+                "batched"
+            )
         body, zero = RigidBody(model.rigid, names), np.zeros(1)
         self._a, self._b = body.gravity_torque(zero), body.gravity_torque(zero + np.pi / 2)
         self._inertia = body.inverse_dynamics(zero, zero, np.ones(1)) - self._a

@@ -254,7 +254,7 @@ def test_a_group_without_a_pair_in_one_of_its_scenarios_has_no_figures() -> None
     rows = changes([*base, *learned], {"both": ["ideal", "soft"]})
     pooled = next(row for row in rows if row.is_group)
     assert not np.isfinite([pooled.relative.value, pooled.improvement.value, pooled.mine]).any()
-    assert pooled.sentence.startswith("nothing to compare: in one of the scenarios did not both stay up to the end")
+    assert pooled.sentence.startswith("nothing to compare: in one of the scenarios there is no episode in which both")
     assert "nan" not in changes_html([pooled], {"learned": "red"}, [])
 
 

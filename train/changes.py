@@ -117,8 +117,8 @@ class Change:
     def _first_words(self) -> str:
         value = self.relative.value
         if not np.isfinite(value):
-            where = "one of the scenarios" if self.is_group else "no episode"
-            return f"nothing to compare: in {where} did {'not ' * self.is_group}both stay up to the end"
+            where = "in one of the scenarios there is no episode in which" if self.is_group else "in no episode did"
+            return f"nothing to compare: {where} both {'stayed' if self.is_group else 'stay'} up to the end"
         direction = (
             "no change"
             if value == 0.0
