@@ -74,6 +74,8 @@ def test_a_fall_and_an_unknown_figure_fall_short(capsys: pytest.CaptureFixture[s
     path = written(figures={"link_eror_rms_rad": 9.0})
     assert failed([str(path)])
     assert "is no metric of this episode; those are" in capsys.readouterr().out
+    assert failed([str(path), "--update"])
+    assert "link_eror_rms_rad is no metric" in capsys.readouterr().out
 
 
 def test_the_shipped_configuration_is_accepted_in_full() -> None:

@@ -28,7 +28,7 @@ from train.cli import main
 from train.constant_search import ConstantSearch
 from train.evaluate import evaluate, make_vector_env
 from train.learn import Training
-from train.mixed_env import MixedVectorEnv
+from train.mixed_env import MixedVectorEnv, threads_of_each
 from train.progress import read_progress
 from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv
@@ -262,6 +262,22 @@ def test_a_mixture_is_its_parts() -> None:
     observation, _ = whole.reset(seed=[1, 2, 3], options={"reset_mask": np.array([False, True, False])})
     again, _ = parts[0].reset(seed=[1, 2], options={"reset_mask": np.array([False, True])})
     np.testing.assert_array_equal(observation[:2], again)
+
+
+@pytest.mark.parametrize(
+    ("cores", "environments", "threads"),
+    [
+        (2, 5, [1, 1, 1, 1, 2]),
+        (2, 1, [2]),
+        (8, 5, [1, 1, 1, 1, 1]),
+        (8, 3, [2, 2, 2]),
+        (1, 3, [1, 1, 1]),
+        (4, 4, [1] * 4),
+    ],
+)
+def test_the_last_environments_share_what_cores_are_left(cores: int, environments: int, threads: list[int]) -> None:
+    """Catches a core that waits while the last of five scenarios steps, and more threads than cores."""
+    assert threads_of_each(cores, environments) == threads
 
 
 def test_rewards_of_a_scenario_count_by_its_weight() -> None:

@@ -86,7 +86,7 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
         output: Folder for bench.json and bench.md; default runs/bench, numbered if taken.
 
     Returns:
-        Whether all figures kept their bounds.
+        Whether all figures kept their bounds; with `update` whether all have a value.
 
     Raises:
         ConfigurationError: Names or options that do not exist.
@@ -112,11 +112,10 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
     if update:
         _accept(path, config, evaluations)
         console.print(f"accepted the figures into {path}", soft_wrap=True)
-        return all(np.isfinite(figure.measured) for figure in figures)
-    for figure in figures:
-        if figure.problem:
-            console.print(f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False)
-    return not any(figure.problem for figure in figures)
+    short = [figure for figure in figures if (np.isnan(figure.measured) if update else figure.problem)]
+    for figure in short:
+        console.print(f"{figure.case}: {figure.problem}", soft_wrap=True, markup=False, highlight=False)
+    return not short
 
 
 def _figures(case: BenchCase, evaluation: Evaluation, margin: float) -> list[Figure]:

@@ -15,7 +15,7 @@ from train.changes import changes, merged
 from train.changes_tables import print_changes, write_statistics
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import Environment, Reference, environment
-from train.evaluate import Evaluation, make_policy, make_vector_env
+from train.evaluate import Evaluation, make_policy, with_one_world
 from train.families import expand
 from train.figures import draw_figures
 from train.report import Results, require_plotly, write_report
@@ -204,8 +204,7 @@ def _require_each_once(what: str, values: Sequence[object]) -> None:
 
 def try_out(conditions: Sequence[Condition]) -> None:
     """Make environments and policies once, so that a wrong name fails before anything runs."""
-    for condition in conditions:
-        env = make_vector_env(condition, 1)
+    for condition, env in with_one_world(conditions):
         try:
             policy = make_policy(condition.policy, env, condition.policy_options)
         except ConfigurationError as error:

@@ -1,7 +1,7 @@
 """Run a policy in an environment, many episodes at once; keep its metrics, one time series, and the static points."""
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -119,11 +119,22 @@ def make_vector_env(
     )
 
 
-def num_steps(condition: Condition) -> int:
-    """Control steps that all episodes of a condition take, for progress bars."""
-    env = make_vector_env(condition, 1)
-    batches = -(-condition.episodes // _worlds_at_once(condition))
-    return batches * env.unwrapped.task.num_steps
+def with_one_world(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
+    """Conditions, each with an environment of one world, which those that differ by their policy share."""
+    made: dict[str, Any] = {}
+    for condition in conditions:
+        key = repr((condition.env, condition.arguments))
+        if key not in made:
+            made[key] = make_vector_env(condition, 1)
+        yield condition, made[key]
+
+
+def num_steps(conditions: Iterable[Condition]) -> list[int]:
+    """Control steps that all episodes of each condition take, for progress bars."""
+    return [
+        -(-condition.episodes // _worlds_at_once(condition)) * env.unwrapped.task.num_steps
+        for condition, env in with_one_world(conditions)
+    ]
 
 
 def _worlds_at_once(condition: Condition) -> int:

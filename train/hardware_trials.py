@@ -1,6 +1,7 @@
 """What `elastic hardware prove` measures, each against an emulated bus through the real SDKs."""
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -197,12 +198,14 @@ def faults(share: float) -> Trial:
                 tally.update({**_taken(events, seen), "beyond": _beyond(events, limits)})
                 if message:
                     reasons[message.split(";")[0].split(":")[0]] += 1
-                    off_s.append(_off_after_fault(events))
+                    off_s += _off_after_fault(events, emulator)
+    stops = reasons.total()
+    held_up = f" ({stops - len(off_s)} because this program was held up)" if stops > len(off_s) else ""
     slow, longest = sum(not t <= PERIOD_S + _CLOCK_S for t in off_s), max(off_s, default=0.0)
     return Trial(
         "faults", "1000 faults: no wrong value taken, no goal beyond the limits, torque off within a cycle of a fault",
         f"{number} faults: {tally['wrong']} wrong of {tally['accepted']} replies taken, {tally['missing']} missing, "
-        f"{tally['beyond']} goals beyond, {len(off_s)} stops, torque off after at most {1e3 * longest:.1f} ms",
+        f"{tally['beyond']} goals beyond, {stops} stops{held_up}, torque off after at most {1e3 * longest:.1f} ms",
         not (tally["wrong"] or tally["beyond"] or slow), {**tally, "reasons": dict(reasons), "off_s": off_s},
     )  # fmt: skip
 
@@ -280,11 +283,16 @@ def _beyond(events: Sequence[Event], limits: SafetyLimits) -> int:
     return number
 
 
-def _off_after_fault(events: Sequence[Event]) -> float:
-    """Time from the end of the wait for the last reply to torque off at the servos [s]."""
-    asked = max((t for t, _, name, _ in events if name == "present_position"), default=np.inf)
+def _off_after_fault(events: Sequence[Event], emulator: RunningEmulator) -> list[float]:
+    """Time from the end of the wait for the last reply to torque off at the servos [s].
+
+    Nothing where no servo was asked: this program was held up between two cycles until it counted as one that hangs.
+    """
+    asked = max((t for t, _, name, _ in events if name == "present_position"), default=None)
+    if asked is None:
+        return [math.inf] if any(emulator.state()["torque_on"]) else []
     off = [t for t, _, name, value in events if name == "torque_enable" and value == 0 and t >= asked]
-    return max(min(off, default=np.inf) - asked - _REPLY_TIMEOUT_S, 0.0)
+    return [max(min(off, default=math.inf) - asked - _REPLY_TIMEOUT_S, 0.0)]
 
 
 def killed(share: float) -> Trial:
@@ -346,12 +354,16 @@ def _ending(name: str, required: str, number: int, took: list[float], spoiled: i
         said = f"nothing: all {spoiled} tries had stopped before by themselves"
         return Trial(name, f"{required}, {number} of {number}", said, False, figures)
     within = sum(t <= _TORQUE_OFF_S for t in took)
-    before = f"; {spoiled} more had stopped before by themselves, for want of replies" if spoiled else ""
     return Trial(
         name, f"{required}, {number} of {number}",
-        f"{within} of {number}; median {1e3 * float(np.median(took)):.1f} ms, at most {1e3 * max(took):.1f} ms{before}",
+        f"{within} of {number}; median {1e3 * float(np.median(took)):.1f} ms, at most {1e3 * max(took):.1f} ms"
+        + _stopped_before(spoiled),
         within == number, figures,
     )  # fmt: skip
+
+
+def _stopped_before(spoiled: int) -> str:
+    return f"; {spoiled} more had stopped before by themselves, for want of replies" if spoiled else ""
 
 
 def _end_once(
@@ -400,29 +412,34 @@ def _wait_until_free(port: str) -> None:
 def unplugged(share: float) -> Trial:
     """The adapter is pulled out in the middle of cycles."""
     number, generator = _times(50, share), np.random.default_rng(0)
-    clear = 0
+    told: list[bool] = []
+    spoiled = 0
     with RunningEmulator(EmulatorConfig(faults=_USB_LATENCY)) as emulator:
-        for _ in range(number):
+        while len(told) < number and spoiled < number:
             with SupervisedBus({emulator.port: [1]}) as bus:
-                bus.enable()
-                clear += _unplug(emulator, bus, generator)
+                _enable(bus, SafetyLimits())
+                one = _unplug(emulator, bus, generator)
             emulator.faults(unplugged=False)
+            if one is None:
+                spoiled += 1
+            else:
+                told.append(one)
     return Trial(
         "unplugged", f"unplug during a write: a clear statement that the bus is gone, {number} of {number}",
-        f"{clear} of {number}", clear == number, {},
+        f"{sum(told)} of {number}{_stopped_before(spoiled)}", sum(told) == number, {"spoiled": spoiled},
     )  # fmt: skip
 
 
-def _unplug(emulator: RunningEmulator, bus: SupervisedBus, generator: np.random.Generator) -> bool:
-    """Whether the program is told that its bus, by name, is gone."""
+def _unplug(emulator: RunningEmulator, bus: SupervisedBus, generator: np.random.Generator) -> bool | None:
+    """Whether the program is told that its bus, by name, is gone; None if the motion had ended before."""
     port, when = emulator.port, int(generator.integers(5, 15))
     for cycle in range(40):
         try:
             bus.exchange(np.zeros(1), time.monotonic() + float(generator.uniform(0.001, PERIOD_S)))
         except BusGoneError as error:
-            return cycle >= when - 1 and port in str(error) and "gone" in str(error)
-        except HardwareError:
-            return False
+            return cycle > when and port in str(error) and "gone" in str(error)
+        except FaultError:
+            return None if cycle <= when else False
         if cycle == when:
             emulator.faults(unplugged=True)
     return False

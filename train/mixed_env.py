@@ -22,7 +22,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """The worlds of several vector environments, one environment's after the other's.
 
     A policy costs hardly more for all of them than for those of one. The environments step side by side on threads,
-    while the physics of one runs without Python: give each one thread of physics. The results do not depend on it.
+    while the physics of one runs without Python: give each one thread of physics, and more to those for which no other
+    is left to step beside. The results do not depend on it.
 
     Worlds that end are begun anew by who wraps this, with options["reset_mask"].
 
@@ -61,7 +62,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         factors = [1.0] * len(envs) if weights is None else list(weights)
         if len(factors) != len(envs):
             raise ConfigurationError(f"weights must be one per environment, {len(envs)}, got {factors}")
-        self._threads = ThreadPoolExecutor(min(num_threads or os.cpu_count() or 1, len(envs)))
+        self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
         sizes = [env.num_envs for env in envs]
         ends = np.cumsum(sizes).tolist()
         self._worlds = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
@@ -122,6 +123,8 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             env.close(**kwargs)
 
     def _side_by_side(self, function: Callable[[Any, slice], Any]) -> list[Any]:
+        if len(self.envs) == 1:  # nothing to wait for in another thread
+            return [function(self.envs[0], self._worlds[0])]
         return list(self._threads.map(function, self.envs, self._worlds))
 
     def _info(self, infos: list[dict[str, Any]], ended: BoolArray) -> dict[str, Any]:
@@ -149,9 +152,19 @@ def mixed_env(
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    own = 1 if len(conditions) > 1 else num_threads
+    threads = threads_of_each(_cores(num_threads), len(conditions))
     envs = [
         make_vector_env(condition, size, own, AutoresetMode.DISABLED)
-        for condition, size in zip(conditions, sizes, strict=True)
+        for condition, size, own in zip(conditions, sizes, threads, strict=True)
     ]
     return MixedVectorEnv(envs, num_threads, weights)
+
+
+def _cores(num_threads: int) -> int:
+    return num_threads or os.cpu_count() or 1
+
+
+def threads_of_each(cores: int, count: int) -> list[int]:
+    """Threads of environments that step side by side: one each, and the last ones share what they leave idle."""
+    last = count % cores
+    return [1] * (count - last) + [cores // max(last, 1)] * last

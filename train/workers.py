@@ -33,7 +33,7 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
         return [
             _on_hardware(condition, f"{n} of {len(conditions)}", console) for n, condition in enumerate(conditions, 1)
         ]
-    steps = [num_steps(condition) for condition in conditions]
+    steps = num_steps(conditions)
     longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
     done = 0
     with show_progress(console, {"control steps": sum(steps)}, transient=True) as show:
@@ -49,7 +49,7 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
-    total, done, say = num_steps(condition), 0, plain_progress(console)
+    (total,), done, say = num_steps([condition]), 0, plain_progress(console)
     console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True)
 
     def advance(steps: int) -> None:
