@@ -37,14 +37,19 @@ class Scores:
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
 
     def evaluate(self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> None:
-        """Score a policy after some decisions, and keep it where it is the best so far."""
+        """Score a policy after some decisions, and keep it where it is the best so far.
+
+        A residual begins as its base, within a hundredth of its range: before the first decision the base's score
+        is its own.
+        """
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
         if self._base_scores is None:
             self._base_scores = self._played(self._config.base, columns)
+        scores = self._base_scores if decisions == 0 else self._played(f"residual:{current}", columns)
         table, ratios = [], []
         for scenario, (mine, falls), (base, base_falls) in zip(
-            self._config.scenarios, self._played(f"residual:{current}", columns), self._base_scores, strict=True
+            self._config.scenarios, scores, self._base_scores, strict=True
         ):
             table.append([decisions, scenario, *mine, *base, falls, base_falls])
             ratios.append(np.nan_to_num(np.array(mine) / base, nan=10.0).mean() + falls)
