@@ -62,10 +62,11 @@ def test_goals_that_are_no_angles_stop_the_motion(goals: list[float]) -> None:
         Guard(SafetyLimits(), np.zeros(1), ["it"]).command(np.array(goals), 0.004)
 
 
-def test_motion_does_not_begin_outside_the_limits() -> None:
-    """Catches a first command that would drag the servo through the limit."""
+@pytest.mark.parametrize("begin", [-0.6, -0.51, np.nan])
+def test_motion_does_not_begin_outside_the_limits(begin: float) -> None:
+    """Catches a first command beyond the limit, also within the margin that is for what is measured on the way."""
     with pytest.raises(FaultError, match="by hand"):
-        Guard(SafetyLimits(lowest_rad=-0.5), np.array([-0.6]), ["it"])
+        Guard(SafetyLimits(lowest_rad=-0.5), np.array([begin]), ["it"])
 
 
 def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> None:
