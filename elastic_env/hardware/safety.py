@@ -55,10 +55,8 @@ class Guard:
         self.goals = np.array(measured, dtype=np.float64)
         self._missed: IntArray = np.zeros(len(measured), dtype=np.int64)
         self._strained: IntArray = np.zeros(len(measured), dtype=np.int64)
-        within = (limits.lowest_rad <= self.goals) & (self.goals <= limits.highest_rad)
-        outside = (
-            ~within
-        )  # the margin is for what is measured on the way: it is the first goal that is asked about here
+        # the margin is for what is measured on the way; where a motion begins is its first goal
+        outside = ~((limits.lowest_rad <= self.goals) & (self.goals <= limits.highest_rad))
         if outside.any():
             raise FaultError(
                 f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad in the servos' "
