@@ -130,8 +130,9 @@ def running() -> Iterator[RunningEmulator]:
 
 @pytest.fixture
 def emulator(running: RunningEmulator) -> RunningEmulator:
-    """The one emulator, without the faults that a test before may have left."""
+    """The one emulator, at rest and without the faults that a test before may have left."""
     running.faults(overload=False, silent=False, unheard=0, late=0, latency_s=0)
+    running.wait_until_rest()
     return running
 
 

@@ -49,8 +49,9 @@ def running() -> Iterator[RunningEmulator]:
 
 @pytest.fixture
 def emulator(running: RunningEmulator) -> RunningEmulator:
-    """The one emulator, without the faults that a test before may have left."""
+    """The one emulator, at rest and without the faults that a test before may have left."""
     running.faults(imu_silent=False, imu_corrupted=0)
+    running.wait_until_rest()
     return running
 
 
@@ -218,7 +219,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
     bus = StillBus()
     monkeypatch.setattr(plant, "SupervisedBus", lambda *_: bus)
     monkeypatch.setattr(plant, "time", bus)
-    monkeypatch.setattr(plant, "prefer_realtime", lambda: None)
+    monkeypatch.setattr(plant, "prefer_realtime", lambda _: None)
     return bus
 
 

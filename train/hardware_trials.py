@@ -24,7 +24,7 @@ from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
-from elastic_env.hardware.realtime import give_up_realtime, prefer_realtime, sleep_until
+from elastic_env.hardware.realtime import Priority, give_up_realtime, prefer_realtime, sleep_until
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.hardware.supervised import SupervisedBus
 from elastic_env.tasks.testbed_config import TestbedConfig
@@ -34,7 +34,6 @@ _USB_LATENCY = Faults(latency_s=1e-3)
 _TORQUE_OFF_S = 0.1
 _REPLY_TIMEOUT_S = 0.003
 _SWING_S = 2.0
-_LONGEST_SWING_S, _REST_RAD_S = 10.0, 0.02
 _CLOCK_S = 1e-3  # for a packet on its way between two processes
 _CYCLES_BETWEEN = 6
 _PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
@@ -144,7 +143,7 @@ def _beside_the_program(config: EmulatorConfig) -> Iterator[RunningEmulator]:
         os.sched_setaffinity(0, cores[-1:])  # which the emulator inherits
         with RunningEmulator(config) as emulator:
             os.sched_setaffinity(0, cores[:-1] or cores)
-            prefer_realtime()
+            prefer_realtime(Priority.LOOP)
             yield emulator
     finally:
         give_up_realtime()
@@ -375,7 +374,7 @@ def _end_once(
     emulator: RunningEmulator, generator: np.random.Generator, end: Callable[[Any, int], None]
 ) -> float | None:
     """Time from the end of the program to torque off [s]; None if the motion had ended before."""
-    _wait_until_rest(emulator)
+    emulator.wait_until_rest()
     program = subprocess.Popen(
         [sys.executable, "-m", "train.wave", emulator.port, "1"], stdout=subprocess.PIPE, text=True,
         start_new_session=True,
@@ -404,18 +403,6 @@ def _end_once(
         program.kill()
         program.communicate()
         _wait_until_free(emulator.port)
-
-
-def _wait_until_rest(emulator: RunningEmulator) -> None:
-    """Wait until joints that were let go have swung out: torque goes on at rest only."""
-    deadline, before = time.monotonic() + _LONGEST_SWING_S, emulator.state()
-    while time.monotonic() < deadline:
-        time.sleep(0.1)
-        now = emulator.state()
-        moved = np.abs(np.subtract(now["theta"], before["theta"])).max()
-        if moved < _REST_RAD_S * (now["time_s"] - before["time_s"]):
-            return
-        before = now
 
 
 def _wait_until_free(port: str) -> None:

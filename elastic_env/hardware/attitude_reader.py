@@ -8,7 +8,7 @@ from typing import Any
 
 from elastic_env.errors import missing_extra
 from elastic_env.hardware.attitude import Attitude, SharedSample
-from elastic_env.hardware.realtime import prefer_realtime
+from elastic_env.hardware.realtime import Priority, prefer_realtime
 
 _CHANNELS = ("estRoll", "estPitch", "estYaw")
 _WAIT_MS = 20
@@ -21,6 +21,7 @@ def read(shared: SharedSample, port: str, baudrate: int) -> None:
     What lay in the port's buffer before has no known age and is passed over. Damaged packets the library drops itself.
     """
     mscl = _library()
+    prefer_realtime(Priority.IMU_READER, with_threads=True)  # the library reads in one of its own
     connection = mscl.Connection.Serial(port, baudrate)
     node = mscl.InertialNode(connection)
     begin = time.monotonic()
@@ -51,7 +52,6 @@ def _sample(packet: Any) -> Attitude | None:
 
 
 if __name__ == "__main__":
-    prefer_realtime()
     try:
         read(SharedSample(int(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
     except Exception as error:

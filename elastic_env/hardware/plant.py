@@ -11,7 +11,7 @@ import numpy as np
 
 from elastic_env.hardware.attitude import AttitudeStream, link_angle
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.realtime import give_up_realtime, prefer_realtime
+from elastic_env.hardware.realtime import Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle, SupervisedBus
 from elastic_env.hardware.torque_line import torque_of_current
@@ -160,9 +160,9 @@ class ServoPlant:
         settings = self.settings
         if self._bus is None:
             self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
-            prefer_realtime()
             if settings.imu_port is not None:
                 self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s)
+            prefer_realtime(Priority.LOOP)
         return self._bus
 
     @contextmanager

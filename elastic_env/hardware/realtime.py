@@ -4,28 +4,51 @@ import contextlib
 import gc
 import os
 import time
+from enum import IntEnum
 
-_PRIORITY = 20
+
+class Priority(IntEnum):
+    """Who goes before whom: what ends a motion before what moves, however busy that is."""
+
+    LOOP = 5
+    IMU_READER = 10
+    SUPERVISOR = 15
+    EMULATOR = 20
 
 
-def prefer_realtime() -> bool:
-    """Ask for real-time scheduling of this process; whether the system grants it (it needs the right to, see docs).
+def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
+    """Ask for real-time scheduling of this thread; whether the system grants it (it needs the right to, see docs).
 
     What is in memory now is left out of garbage collections: one that looks at all of it takes ten control periods.
+
+    Args:
+        priority: Among the processes of a motion.
+        with_threads: Whether threads and programs that it starts from now on get the same; else they run as others do.
     """
     gc.collect()
     gc.freeze()
     with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        policy = os.SCHED_FIFO if with_threads else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
         return True
     return False
+
+
+def schedule_like(thread_id: int) -> None:
+    """Schedule this thread as another of this program is.
+
+    Args:
+        thread_id: Native id of the other.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.sched_getscheduler(thread_id), os.sched_getparam(thread_id))
 
 
 def give_up_realtime() -> None:
     """Back to the scheduling of all others, and to collections of everything."""
     gc.unfreeze()
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with contextlib.suppress(OSError, AttributeError):  # the flag may be taken back with special rights only
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
 
 
 def sleep_until(moment_s: float) -> None:

@@ -16,6 +16,7 @@ from elastic_env.hardware.channel import Channel
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
 from elastic_env.hardware.port import DEFAULT_BAUDRATE
 from elastic_env.hardware.protocol import require_ids
+from elastic_env.hardware.realtime import schedule_like
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.signals import Array, BoolArray
 
@@ -144,7 +145,8 @@ class SupervisedBus:
         """
         self.stop_keeping()
         self._is_kept.set()
-        self._keeper = threading.Thread(target=self._keep, args=(goals, time.monotonic() + limit_s), daemon=True)
+        now, caller = time.monotonic(), threading.get_native_id()
+        self._keeper = threading.Thread(target=self._keep, args=(goals, now + limit_s, caller), daemon=True)
         self._keeper.start()
 
     def stop_keeping(self) -> None:
@@ -154,7 +156,8 @@ class SupervisedBus:
             self._keeper.join()
             self._keeper = None
 
-    def _keep(self, goals: Array, end_s: float) -> None:
+    def _keep(self, goals: Array, end_s: float, caller: int) -> None:
+        schedule_like(caller)
         with contextlib.suppress(HardwareError):
             while self._is_kept.is_set() and time.monotonic() < end_s:
                 self._exchanged(goals, time.monotonic() + _KEEP_ALIVE_S)

@@ -24,7 +24,7 @@ from elastic_env.hardware.channel import Channel
 from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.control_table import explain_errors
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
-from elastic_env.hardware.realtime import prefer_realtime, sleep_until
+from elastic_env.hardware.realtime import Priority, prefer_realtime, sleep_until
 from elastic_env.hardware.safety import Guard, SafetyLimits
 
 _LONGEST_WAIT_S = 0.02
@@ -259,7 +259,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     """Open the ports, say how that went, and serve."""
     for number in _SIGNALS:
         signal.signal(number, _end)
-    prefer_realtime()
+    prefer_realtime(Priority.SUPERVISOR, with_threads=True)  # one for each of several buses
     buses = [Bus(port, baudrate) for port in ports]
     opened: list[Bus] = []
     try:

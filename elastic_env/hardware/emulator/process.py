@@ -27,7 +27,7 @@ from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.mip import attitude_packet
 from elastic_env.hardware.emulator.servo import EmulatedServo
 from elastic_env.hardware.emulator.wire import EmulatedBus
-from elastic_env.hardware.realtime import prefer_realtime
+from elastic_env.hardware.realtime import Priority, prefer_realtime
 from elastic_env.sensors import attitude
 
 _PHYSICS_S, _LONGEST_PHYSICS_S = 2e-3, 5e-3  # between two advances: as a rule, and while replies go out
@@ -224,7 +224,7 @@ class Emulator:
 def serve(config: EmulatorConfig) -> None:
     """Emulate until the input ends; requests come as JSON lines, one each, and so do the answers."""
     emulator = Emulator(config)
-    prefer_realtime()
+    prefer_realtime(Priority.EMULATOR)
     answer: Any = emulator.ports
     pending = b""
     while True:

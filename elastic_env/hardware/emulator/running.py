@@ -3,10 +3,16 @@
 import json
 import subprocess
 import sys
+import time
 from typing import Any
+
+import numpy as np
 
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.errors import HardwareError
+
+_LONGEST_SWING_S, _REST_RAD_S = 10.0, 0.02
+_LOOK_S, _STILL_LOOKS = 0.05, 3  # where a swing turns back it stands still for one look
 
 
 class RunningEmulator:
@@ -42,6 +48,22 @@ class RunningEmulator:
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
         return self._ask({"state": True})
+
+    def wait_until_rest(self) -> None:
+        """Wait until joints that were let go have swung out: torque goes on at rest only.
+
+        Raises:
+            HardwareError: They still move after 10 s.
+        """
+        deadline, before, still = time.monotonic() + _LONGEST_SWING_S, self.state(), 0
+        while still < _STILL_LOOKS:
+            if time.monotonic() > deadline:
+                raise HardwareError(f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?")
+            time.sleep(_LOOK_S)
+            now = self.state()
+            moved = np.abs(np.subtract(now["theta"], before["theta"])).max()
+            still = still + 1 if moved < _REST_RAD_S * (now["time_s"] - before["time_s"]) else 0
+            before = now
 
     def wait(self) -> None:
         """Wait until it ends by itself, or an interrupt comes."""
