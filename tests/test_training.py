@@ -129,6 +129,21 @@ def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     assert read_progress(killed) == read_progress(whole)
 
 
+def test_before_its_first_decision_a_residual_is_scored_as_what_it_is(tmp_path: Path) -> None:
+    """Catches a beginning that is far from the base, whose score is taken for it without playing."""
+    config = TrainConfig(**{**SMALL, **PPO})
+    with pytest.raises(KeyboardInterrupt):
+        Training(config, 1, tmp_path).run(interrupted_after(1))
+    (row,) = read_progress(tmp_path)
+    assert row["decisions"] == 0
+    metric = "link_error_rms_rad"
+    begun = config.condition("nominal", f"residual:{tmp_path / 'best'}")
+    ((found, failed),) = played_together([begun], [metric])
+    assert not failed.any()
+    assert row[metric] == row[f"base_{metric}"] == pytest.approx(found.mean(), rel=2e-5)
+    assert found.mean() != row[metric]
+
+
 SEARCH: dict[str, Any] = {
     **SMALL, "base": "input", "algorithm": "CMA-ES", "worlds": 8, "decisions": 1200, "evaluate_every": 600,
     "checkpoint_every": 200, "algorithm_options": {"population_size": 8, "sigma": 0.3}, "scenarios": ["ideal+soft"],
