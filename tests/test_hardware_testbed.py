@@ -1,6 +1,7 @@
 """The environment on hardware, the IMU's stream and the commands, on an emulated bus."""
 
 import csv
+import gc
 import json
 import os
 import signal
@@ -106,6 +107,42 @@ def test_without_an_imu_the_link_is_unknown(emulator: RunningEmulator) -> None:
         env.unwrapped.truth()
     env.close()
     assert emulator.state()["torque_on"] == [False]
+
+
+def test_a_step_outside_an_episode_says_so_and_touches_nothing(emulator: RunningEmulator) -> None:
+    """Catches a port that is opened for it, and advice that nobody can follow from Python."""
+    env = make_hardware(emulator)
+    env.reset()
+    env.close()
+    emulator.events()
+    with pytest.raises(HardwareError, match=rf"no episode is under way at {emulator.port}.* reset\(\)"):
+        env.step(np.zeros(1, dtype=np.float32))
+    assert emulator.events() == []
+
+
+def test_a_link_that_turns_against_its_motor_stops_the_motion(emulator: RunningEmulator) -> None:
+    """Catches an IMU whose sign is wrong, by which a policy would be scored and identification would fit K."""
+    env = make_hardware(emulator, imu_port=emulator.imu_port, imu_sign=-1, reference={"kind": "hold", "lower": -0.5})
+    with pytest.raises(HardwareError, match="imu_sign") as caught:
+        env.reset()
+    assert caught.value.__notes__ == [f"torque at {emulator.port} is off"]
+    assert emulator.state()["torque_on"] == [False]
+
+
+def test_a_testbed_that_is_forgotten_lets_go(emulator: RunningEmulator) -> None:
+    """Catches a cell of a notebook that cannot be run a second time: its own kernel has the ports."""
+
+    def forget() -> None:
+        make_hardware(emulator, imu_port=emulator.imu_port).reset()
+
+    forget()
+    gc.collect()
+    assert emulator.state()["torque_on"] == [False]
+    AttitudeStream(emulator.imu_port, oldest_s=0.5).close()
+    emulator.wait_until_rest()
+    again = make_hardware(emulator)
+    again.reset()
+    again.close()
 
 
 def test_nothing_moves_unless_somebody_agrees(emulator: RunningEmulator) -> None:
@@ -302,6 +339,9 @@ def test_commands_run_on_hardware(
     )
     options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
     assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5
+    patient = hardware_arguments(None, None, Path("mounting.yaml"), yes=True, patient=True)
+    assert [patient["limits"][name] for name in ("patience_cycles", "slew_rad_s")] == [10, 2.5]
+    assert patient["imu_oldest_s"] == 0.2
     assert "pendulum" not in hardware_arguments(emulator.port, None, None, yes=True)  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
     command(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"], capsys)
@@ -339,10 +379,11 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
         hardware_arguments("p", None, tmp_path, yes=False)
 
 
+@pytest.mark.parametrize(("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")])
 def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
-    emulator: RunningEmulator, tmp_path: Path
+    emulator: RunningEmulator, tmp_path: Path, number: signal.Signals, words: str
 ) -> None:
-    """Catches a log that is written at the end only, and Ctrl-C after which nobody knows what the servo does."""
+    """Catches a log that is written at the end only, and an end after which nobody knows what the servo does."""
     mounting = tmp_path / "mounting.yaml"
     mounting.write_text("approach_rad_s: 2.0\nlimits: {patience_cycles: 10, hang_s: 0.09}\n")
     command = [
@@ -354,12 +395,13 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
         deadline = time.monotonic() + 60.0
         while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") > 250):
             time.sleep(0.05)  # what is kept is seen on the disk while the run goes on
-        program.send_signal(signal.SIGINT)
+        program.send_signal(number)
         said, complained = program.communicate(timeout=30)
     rows = list(csv.DictReader(log.read_text().splitlines()))
     assert len(rows) >= 250
     assert f"cut short; the {len(rows)} steps until then are in {log}" in said
-    assert f"interrupted; torque at {emulator.port} is off" in complained
+    assert f"{words}; torque at {emulator.port} is off" in complained
+    assert program.returncode == 128 + number
     assert emulator.state()["torque_on"] == [False]
 
 
@@ -375,6 +417,7 @@ def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) ->
         (["hardware", "scan", "/tmp"], "a folder"),
         (["identify", "--port", "/dev/null"], "--imu-port"),
         (["identify", "--yes"], "--port"),
+        (["evaluate", "--patient"], "--patient is for a real testbed"),
         (["evaluate", "--env", "walker", "--port", "/dev/null"], "testbed"),
         (["hardware", "run"], "--port"),
         (["hardware", "prove", "--only", "kiled"], "killed"),

@@ -1,7 +1,11 @@
 """The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, hardware, demo."""
 
+import contextlib
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,6 +38,29 @@ def _with_notes(error: BaseException, said: str | None = None) -> str:
     return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
 
 
+class _EndedError(KeyboardInterrupt):
+    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
+
+
+def _end(number: int, _: Any) -> None:
+    signal.signal(number, signal.SIG_IGN)  # a second one does not interrupt what the first one asked for
+    raise _EndedError(number)
+
+
+@contextlib.contextmanager
+def _ended_by(*numbers: int) -> Iterator[None]:
+    """Signals that would end this program without a word end what is within by an exception; ignored ones do not."""
+    is_main = threading.current_thread() is threading.main_thread()
+    taken = [number for number in numbers if is_main and signal.getsignal(number) == signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, _end)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
     if "" not in sys.path and str(Path.cwd()) not in sys.path:
@@ -44,10 +71,13 @@ def main(arguments: list[str] | None = None) -> None:
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
     )  # fmt: skip
     try:
-        command.run()
+        with _ended_by(signal.SIGTERM, signal.SIGHUP):
+            command.run()
     except ElasticError as error:
         Console(stderr=True).print(f"[bold red]error:[/] {escape(_with_notes(error))}", highlight=False, soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt as error:
-        Console(stderr=True).print(_with_notes(error, "interrupted"), highlight=False, markup=False, soft_wrap=True)
-        os._exit(130)  # worker processes must not keep the terminal waiting
+        number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
+        said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+        Console(stderr=True).print(_with_notes(error, said), highlight=False, markup=False, soft_wrap=True)
+        os._exit(128 + number)  # worker processes must not keep the terminal waiting

@@ -294,7 +294,7 @@ _WALKER = Environment(
 _HARDWARE = replace(
     _TESTBED,
     id="elastic_env/HardwareTestbed-v0",
-    columns=tuple(column for column in _TESTBED.columns if column.title != "est."),
+    columns=tuple(column for column in _TESTBED.columns if column.title not in ("est.", "peak")),  # IMU- or IMU+ is it
     traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
     subject="link error by the IMU",
     note="On hardware there is no truth to score an estimate by.",

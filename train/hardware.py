@@ -32,6 +32,7 @@ from train.runs import run_folder
 
 _SCAN_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 _SHOWN_S = 1.0
+_PATIENT_LIMITS, _PATIENT_IMU_S = {"patience_cycles": 10, "hang_s": 0.09}, 0.2
 
 
 class Mounting(HardwareSettings):
@@ -40,7 +41,9 @@ class Mounting(HardwareSettings):
     pendulum: Pendulum = Pendulum()
 
 
-def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | None, yes: bool) -> dict[str, Any]:
+def hardware_arguments(
+    port: str | None, imu_port: str | None, settings: Path | None, *, yes: bool, patient: bool = False
+) -> dict[str, Any]:
     """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command; empty without hardware.
 
     Args:
@@ -48,13 +51,15 @@ def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | 
         imu_port: Port of the IMU, likewise.
         settings: YAML file of a `Mounting`, or None.
         yes: Whether nobody need agree before the first motion.
+        patient: Whether a motion goes on for as long as it can where replies, commands or attitudes are missing.
 
     Raises:
         ConfigurationError: There are options of hardware, but no port.
     """
     if port is None and settings is None:
-        if imu_port is not None or yes:
-            option = "--yes" if imu_port is None else "--imu-port"
+        without = {"--imu-port": imu_port is not None, "--yes": yes, "--patient": patient}
+        if any(without.values()):
+            option = next(name for name, is_given in without.items() if is_given)
             raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
         return {}
     options = {"port": port, "imu_port": imu_port, "confirm": False if yes else None}
@@ -62,6 +67,8 @@ def hardware_arguments(port: str | None, imu_port: str | None, settings: Path | 
     chosen = Mounting(**given) if settings is None else load_yaml(settings, Mounting, given)
     names = chosen.model_fields_set | options.keys() | {"limits"}
     values = {name: getattr(chosen, name) for name in names}
+    if patient:
+        values |= {"limits": chosen.limits.replace(**_PATIENT_LIMITS), "imu_oldest_s": _PATIENT_IMU_S}
     return {name: value.model_dump() if isinstance(value, Model) else value for name, value in values.items()}
 
 
@@ -85,7 +92,10 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
     if number:
         console.print(table)
     else:
-        console.print(f"no servo answers at {port}; check power, wiring and baud rate", soft_wrap=True)
+        console.print(
+            f"no servo answers at {port}; check power, wiring and baud rate, and whether it is the IMU's port",
+            soft_wrap=True,
+        )
     return number
 
 
@@ -214,7 +224,7 @@ def emulate(config: EmulatorConfig, console: Console) -> None:
         console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
         console.print(
             f"for example: elastic hardware check {emulator.port}, or\n"
-            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes\nCtrl-C ends it.",
+            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
             soft_wrap=True,
         )
         emulator.wait()

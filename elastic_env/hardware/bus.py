@@ -289,7 +289,8 @@ class Bus:
             self.num_retries += 1
         raise ReplyError(
             f"servo {servo_id} at {self.name} {problem} in {_TRIES} tries ({self.port.baudrate} bit/s); check "
-            "power, wiring, id and baud rate, see: elastic hardware scan"
+            "power, wiring, id and baud rate, and whether this is the port of the servos and not the IMU's, see: "
+            f"elastic hardware scan {self.name}"
         )
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:

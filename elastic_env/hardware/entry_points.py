@@ -31,7 +31,7 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if port is None:
-        raise ConfigurationError(f"{_ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan")
+        raise ConfigurationError(f"{_ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT")
     of_settings = [name for name in HardwareSettings.model_fields if name != "port"]
     of_testbed = [name for name in inspect.signature(configure_testbed).parameters if name not in _OF_A_SIMULATION]
     for name in arguments:

@@ -1,9 +1,10 @@
 """Servo and IMU in the place of the physics: one control cycle on the bus is one advance of a `Simulation`."""
 
+import math
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import mujoco
@@ -77,6 +78,11 @@ class ServoPlant:
         self._goal = self._due_s = self._read_s = 0.0
         self._is_kept = False
 
+    def __del__(self) -> None:
+        """A testbed that nobody holds any more gives its ports back."""
+        with suppress(Exception):
+            self.close()
+
     def begin(self, angle: float) -> None:
         """Torque on, slowly to an angle, and wait there.
 
@@ -99,7 +105,13 @@ class ServoPlant:
             self._is_kept = True
 
     def advance(self, num_substeps: int) -> None:  # noqa: ARG002  one period, whatever the physics would make of it
-        """Command `ctrl`, wait for the end of the control period, read."""
+        """Command `ctrl`, wait for the end of the control period, read.
+
+        Raises:
+            HardwareError: No episode is under way, or something of the hardware is not as it must be.
+        """
+        if self._bus is None:
+            raise HardwareError(f"no episode is under way at {self.settings.port}: begin one with reset()")
         with self._or_closed():
             if self._is_kept:  # the first step may come any time after the reset
                 self._opened().stop_keeping()
@@ -247,4 +259,18 @@ class ServoPlant:
         self.motor_torque[0] = settings.direction * float(torque_of_current(cycle.states.current[0]))
         if self._imu is not None:
             sample = self._imu.latest()
-            self.qpos[0, at.q[0]] = link_angle(sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            q = link_angle(sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            self._require_together(q, cycle.states.time_s - sample.time_s)
+            self.qpos[0, at.q[0]] = q
+
+    def _require_together(self, q: float, age_s: float) -> None:
+        """Refuse a link that is where no gear bends to; the motor has moved on since the IMU measured."""
+        settings, at = self.settings, self._at
+        apart = math.remainder(q - float(self.qpos[0, at.theta[0]]), 2.0 * math.pi)
+        moved = abs(float(self.qvel[0, at.theta_dot[0]])) * max(age_s, 0.0)
+        if abs(apart) > settings.largest_deflection_rad + moved:
+            raise HardwareError(
+                f"the link, by the IMU at {settings.imu_port}, is {apart:+.2f} rad from the servo's angle, more than "
+                f"largest_deflection_rad {settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
+                "imu_offset_rad of the mounting, or look what has come loose"
+            )

@@ -29,6 +29,7 @@ class HardwareSettings(Model):
     imu_sign: Literal[1, -1] = 1
     """Sign of the joint angle against that Euler angle."""
     imu_offset_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi, description="what it shows where q is 0")
+    largest_deflection_rad: float = quantity("rad", 0.2, gt=0, le=1, description="bend that stops it, by the IMU")
     approach_rad_s: float = quantity("rad/s", 0.2, gt=0, le=2, description="peak speed to the start and back to rest")
     confirm: bool = True
     """Whether somebody at the terminal must agree before the first motion."""

@@ -13,7 +13,10 @@ from train.commands.options import CONSOLE, OnHardware, motion
 
 @dataclass
 class Scan:
-    """List the servos at a port, with model and firmware; nothing moves."""
+    """List the servos at a port, with model and firmware; nothing moves.
+
+    Example: elastic hardware scan /dev/ttyUSB0
+    """
 
     port: Annotated[str, tyro.conf.Positional]
     """Port, such as /dev/ttyUSB0."""
@@ -30,7 +33,10 @@ class Scan:
 
 @dataclass
 class Check:
-    """Look at port, servos and IMU before anything moves, and say what to do; exit code 1 where something is."""
+    """Look at port, servos and IMU before anything moves, and say what to do; exit code 1 if there is anything to do.
+
+    Example: elastic hardware check /dev/ttyUSB0 --ids 1 --imu-port /dev/ttyACM0
+    """
 
     port: Annotated[str, tyro.conf.Positional]
     """Port, such as /dev/ttyUSB0."""
@@ -54,12 +60,13 @@ class Run:
     """Play one episode on the real testbed, show it as it goes, and keep every step.
 
     Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input --reference sine
+    A short one: --reference '{kind: sine, amplitude: 0.2, duration_s: 5}'
     """
 
     policy: str = "uncompensated"
     """Baseline, residual:PATH, or "module:function" for one's own."""
     reference: str | None = None
-    """Motion, as in elastic evaluate; default hold."""
+    """Motion, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
     output: Path | None = None
     """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if taken."""
     on: OnHardware = field(default_factory=OnHardware)
@@ -70,7 +77,7 @@ class Run:
         from train.hardware import run
 
         if not (arguments := self.on.arguments):
-            raise ConfigurationError("--port is needed; see: elastic hardware scan, elastic hardware emulate")
+            raise ConfigurationError("--port is needed; see: elastic hardware scan PORT, elastic hardware emulate")
         folder = run(arguments, motion("hardware", self.reference), PolicySpec(name=self.policy), CONSOLE, self.output)
         CONSOLE.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True)
 

@@ -34,15 +34,18 @@ class OnHardware:
     """YAML file of signs, zeros, ids and limits of the real testbed, see docs/hardware.md."""
     yes: bool = False
     """Begin to move without asking."""
+    patient: bool = False
+    """Bear ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for emulators, whose
+    pseudo-terminals stall where the computer is busy."""
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of the environment on hardware; empty for the simulation."""
-        if self.port is None and self.mounting is None and self.imu_port is None and not self.yes:
+        if self == OnHardware():
             return {}
         from train.hardware import hardware_arguments
 
-        return hardware_arguments(self.port, self.imu_port, self.mounting, self.yes)
+        return hardware_arguments(self.port, self.imu_port, self.mounting, yes=self.yes, patient=self.patient)
 
 
 def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:

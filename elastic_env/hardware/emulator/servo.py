@@ -6,7 +6,7 @@ from typing import Protocol
 
 from elastic_env.hardware import protocol
 from elastic_env.hardware.control_table import Register, ServoModel
-from elastic_env.hardware.torque_line import current_of_torque
+from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, current_of_torque
 
 OVERLOAD = 1 << 5
 """Bit of an overload in the hardware error status."""
@@ -78,6 +78,8 @@ class EmulatedServo:
         self._set("firmware_version", 38)
         self._set("id", self.servo_id)
         self._set("return_delay_time", 0)
+        current_limit, allowed_a = self.model.current_limit, current_of_torque(LARGEST_TORQUE_NM)
+        self._set(current_limit, min(self._get(current_limit), int(allowed_a / self.model.current_unit)))
         self._set("present_input_voltage", 240)
         self._set("present_temperature", 35)
 
