@@ -36,6 +36,7 @@ _REPLY_TIMEOUT_S = 0.003
 _SWING_S = 2.0
 _CLOCK_S = 1e-3  # for a packet on its way between two processes
 _CYCLES_BETWEEN = 6
+_AROUND_S = 0.2
 _PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
 """Where missing replies are counted, or are beside the point: a busy computer delays pseudo-terminals."""
 _COARSE = TestbedConfig(timestep_s=1e-3)
@@ -174,6 +175,7 @@ def faults(share: float) -> Trial:
     tally, reasons = Counter[str](), Counter[str]()
     off_s: list[float] = []
     beyond: list[float] = []
+    wrong: list[dict[str, Any]] = []
     left = number
     while left > 0:
         with RunningEmulator(EmulatorConfig(ids=_PAIR)) as emulator, SupervisedBus({emulator.port: _PAIR}) as bus:
@@ -190,7 +192,9 @@ def faults(share: float) -> Trial:
                     more, message = _cycles(bus, begin, _CYCLES_BETWEEN, generator)
                     seen += more
                 events, is_moving, left = emulator.events(), not message, left - 1
-                tally.update(_taken(events, seen))
+                counts, some_wrong = _taken(events, seen)
+                tally.update(counts)
+                wrong += some_wrong
                 beyond += _beyond(events, limits)
                 if message:
                     reasons[message.split(";")[0].split(":")[0]] += 1
@@ -203,7 +207,7 @@ def faults(share: float) -> Trial:
         f"{number} faults: {tally['wrong']} wrong of {tally['accepted']} replies taken, {tally['missing']} missing, "
         f"{len(beyond)} goals beyond, {stops} stops{held_up}, torque off after at most {1e3 * longest:.1f} ms",
         not (tally["wrong"] or beyond or slow),
-        {**tally, "beyond_rad": beyond, "reasons": dict(reasons), "off_s": off_s},
+        {**tally, "beyond_rad": beyond, "reasons": dict(reasons), "off_s": off_s, "wrong_replies": wrong},
     )  # fmt: skip
 
 
@@ -253,9 +257,15 @@ def _cycles(
     return seen, ""
 
 
-def _taken(events: Sequence[Event], seen: Sequence[tuple[float, States]]) -> dict[str, int]:
-    """Compare each position that was taken with what the servo had to say to that very request."""
-    wrong = accepted = missing = 0
+def _taken(
+    events: Sequence[Event], seen: Sequence[tuple[float, States]]
+) -> tuple[dict[str, int], list[dict[str, Any]]]:
+    """Compare each position that was taken with what the servo had to say to that very request.
+
+    Returns:
+        Counts, and what there is to know of the wrong ones: a figure that is not 0 must be explained.
+    """
+    wrong, accepted, missing = [], 0, 0
     for read_s, states in seen:
         for column, servo in enumerate(_PAIR):
             if not states.is_fresh[column]:
@@ -266,8 +276,13 @@ def _taken(events: Sequence[Event], seen: Sequence[tuple[float, States]]) -> dic
                 if who == servo and name == "present_position" and read_s - _CLOCK_S <= t <= states.time_s
             ]  # fmt: skip
             accepted += 1
-            wrong += not asked or round(states.position[column] / _UNIT) != asked[-1]
-    return {"wrong": wrong, "accepted": accepted, "missing": missing}
+            taken = round(states.position[column] / _UNIT)
+            if not asked or taken != asked[-1]:
+                around = [event for event in events if abs(event[0] - read_s) < _AROUND_S]
+                wrong.append(
+                    {"servo": servo, "taken": taken, "read_s": read_s, "time_s": states.time_s, "events": around}
+                )
+    return {"wrong": len(wrong), "accepted": accepted, "missing": missing}, wrong
 
 
 def _beyond(events: Sequence[Event], limits: SafetyLimits) -> list[float]:
