@@ -122,6 +122,7 @@ class Emulator:
             servo.watch(now)
         if self.bus_terminal is not None and has_heard:
             heard = self.bus_terminal.read()
+            now = time.monotonic()  # it may hold what came since the moment before
             if not self.bus_terminal.speaks(self.config.baudrate):
                 heard = b""  # noise
             for packet in self._parser.feed(heard):
