@@ -37,7 +37,7 @@ class Identify:
     second_mass: float | None = None
     """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q from K; such as 0.5."""
     positions: int = 20
-    """Number of static positions, at least 5; on a real joint each takes 13 s or so."""
+    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take five."""
     seed: int = 0
     """Seed of the sensor noise."""
     repeats: int = 1
