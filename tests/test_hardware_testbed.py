@@ -341,7 +341,8 @@ def test_commands_run_on_hardware(
     assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5
     patient = hardware_arguments(None, None, Path("mounting.yaml"), yes=True, patient=True)
     assert [patient["limits"][name] for name in ("patience_cycles", "slew_rad_s")] == [10, 2.5]
-    assert patient["imu_oldest_s"] == 0.2
+    assert patient["imu_oldest_s"] == 0.3  # as the file says, which is more patient still
+    assert hardware_arguments("p", None, None, yes=True, patient=True)["imu_oldest_s"] == 0.2
     assert "pendulum" not in hardware_arguments(emulator.port, None, None, yes=True)  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
     command(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"], capsys)

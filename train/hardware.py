@@ -32,7 +32,9 @@ from train.runs import run_folder
 
 _SCAN_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 _SHOWN_S = 1.0
-_PATIENT_LIMITS, _PATIENT_IMU_S = {"patience_cycles": 10, "hang_s": 0.09}, 0.2
+_PATIENT_IMU_S = 0.2
+PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
+"""The most patient limits there are, for emulators: a busy computer delays pseudo-terminals."""
 
 
 class Mounting(HardwareSettings):
@@ -68,7 +70,8 @@ def hardware_arguments(
     names = chosen.model_fields_set | options.keys() | {"limits"}
     values = {name: getattr(chosen, name) for name in names}
     if patient:
-        values |= {"limits": chosen.limits.replace(**_PATIENT_LIMITS), "imu_oldest_s": _PATIENT_IMU_S}
+        oldest_s = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
+        values |= {"limits": chosen.limits.replace(**PATIENT_LIMITS), "imu_oldest_s": oldest_s}
     return {name: value.model_dump() if isinstance(value, Model) else value for name, value in values.items()}
 
 

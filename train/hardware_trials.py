@@ -28,6 +28,7 @@ from elastic_env.hardware.realtime import Priority, give_up_realtime, prefer_rea
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.hardware.supervised import SupervisedBus
 from elastic_env.tasks.testbed_config import TestbedConfig
+from train.hardware import PATIENT_LIMITS
 from train.wave import PERIOD_S, goal
 
 _USB_LATENCY = Faults(latency_s=1e-3)
@@ -37,7 +38,7 @@ _SWING_S = 2.0
 _CLOCK_S = 1e-3  # for a packet on its way between two processes
 _CYCLES_BETWEEN = 6
 _AROUND_S = 0.2
-_PATIENT = SafetyLimits(patience_cycles=10, hang_s=0.09)
+_PATIENT = SafetyLimits().replace(**PATIENT_LIMITS)
 """Where missing replies are counted, or are beside the point: a busy computer delays pseudo-terminals."""
 _COARSE = TestbedConfig(timestep_s=1e-3)
 """Twelve joints in real time at 0.5 ms would fill a third of a core, and it is the bus that is measured."""

@@ -87,14 +87,14 @@ class AttitudeStream:
         port: Device, such as /dev/ttyACM0.
         baudrate: Bits per second.
         oldest_s: Age at which a sample counts as missing [s].
-        wait_s: How long to wait for the first one [s].
+        wait_s: How long to wait for the first one, with the start of the reader on a busy computer [s].
 
     Raises:
         PortError: There is no such port, it may not be opened, or another program has it.
         AttitudeError: Nothing comes that is an attitude.
     """
 
-    def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 3.0) -> None:
+    def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0) -> None:
         self.port, self._oldest_s = port, oldest_s
         self._lock: int | None = lock_port(port)
         self._process: subprocess.Popen[str] | None = None
