@@ -69,7 +69,9 @@ def test_a_program_that_keeps_the_processor_busy_does_not_keep_torque_on() -> No
     finally:
         busy.kill()
         busy.communicate()
-    assert min(off) - last < 0.1
+    # and not when the program lets go of the core; the kernel, which carries bytes between pseudo-terminals as it runs
+    # all other programs, may itself have to wait, so that the 100 ms asked for are held to by `elastic hardware prove`
+    assert min(off) - last < BUSY_S / 2
 
 
 @pytest.mark.usefixtures("in_realtime")

@@ -350,6 +350,8 @@ class Buses:
 
     def read_states(self, timeout_s: float) -> States:
         """The states of all servos; the time is that of the last reply."""
+        if len(self.buses) == 1:
+            return self.buses[0].read_states(timeout_s)
         parts = self._on_each(lambda bus, _: bus.read_states(timeout_s))
         names = ("position", "velocity", "current", "is_fresh", "has_alert")
         joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)

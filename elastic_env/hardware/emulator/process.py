@@ -116,8 +116,6 @@ class Emulator:
         self._send_due(now)  # replies wait for nothing
         has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
         is_idle = not self._replies and now >= self._settled_s
-        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
-            self._joints.advance(now)
         for servo in self._with_watchdog:
             servo.watch(now)
         if self.bus_terminal is not None and has_heard:
@@ -132,6 +130,8 @@ class Emulator:
                 if packet.instruction == protocol.SYNC_READ:
                     for servo in self._servos:
                         self.events.append((now, servo.servo_id, "present_position", servo.present_position))
+        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:  # after the answers, which are urgent
+            self._joints.advance(now)
         self._send_due(time.monotonic())
         self._send_attitude(now)
         return control in ready
