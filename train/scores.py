@@ -95,7 +95,7 @@ class Scores:
 def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
     is_new = not path.exists()
     with path.open("a", newline="") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")  # as `Scores.forget_after` leaves it
         if is_new:
             writer.writerow(header)
         writer.writerows(rows)
