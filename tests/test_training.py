@@ -106,6 +106,22 @@ def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     assert (tmp_path / "whole" / "progress.csv").read_bytes() == (tmp_path / "part" / "progress.csv").read_bytes()
 
 
+@pytest.mark.parametrize("file", ["model.pt", "state.json", "state.npz"])
+@pytest.mark.parametrize("size", [None, 0, 100])
+def test_a_damaged_checkpoint_is_named(file: str, size: int | None, tmp_path: Path) -> None:
+    """Catches errors of libraries in the place of one that says which files, and what to do."""
+    config = TrainConfig(**{**SMALL, **PPO})
+    with pytest.raises(KeyboardInterrupt):
+        Training(config, 1, tmp_path).run(interrupted_after(96))
+    damaged = tmp_path / "checkpoint" / file
+    if size is None:
+        damaged.unlink()
+    else:
+        damaged.write_bytes(damaged.read_bytes()[:size])
+    with pytest.raises(ElasticError, match=r"checkpoint is damaged or not whole .*; remove it"):
+        Training(config, 1, tmp_path)
+
+
 def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     """Catches a checkpoint that is half written, and a kill that loses or repeats an evaluation."""
     code = (

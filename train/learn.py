@@ -23,7 +23,7 @@ from baselines.residual import ResidualDescription
 from train.algorithms import algorithm_class, options_named
 from train.export import network_of
 from train.sb3_env import SB3VecEnv
-from train.state import capture, read_state, restore, write_state
+from train.state import capture, read_state, readable, restore, write_state
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
 from train.trainer import Trainer
 
@@ -106,7 +106,8 @@ class Training(Trainer):
 
     def _resume(self) -> None:
         path = self.folder / "checkpoint"
-        parameters = torch.load(path / "model.pt", weights_only=True)
+        with readable(path):
+            parameters = torch.load(path / "model.pt", weights_only=True)
         self.model.policy.load_state_dict(parameters["policy"])
         for name, optimiser in self._optimisers().items():
             optimiser.load_state_dict(parameters["optimisers"][name])
