@@ -350,7 +350,7 @@ class Buses:
 
     def read_states(self, timeout_s: float) -> States:
         """The states of all servos; the time is that of the last reply."""
-        if len(self.buses) == 1:
+        if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
             return self.buses[0].read_states(timeout_s)
         parts = self._on_each(lambda bus, _: bus.read_states(timeout_s))
         names = ("position", "velocity", "current", "is_fresh", "has_alert")
