@@ -61,7 +61,7 @@ def configure_testbed(
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
     return TestbedConfig(
         reference=make_reference(reference),
-        scenario=make_scenario(scenario),
+        scenario=make_scenario(scenario, testbed=True),
         joint=chosen,
         pendulum=pendulum if isinstance(pendulum, Pendulum) else Pendulum(**(pendulum or {})),
         form=form,

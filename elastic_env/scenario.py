@@ -109,8 +109,12 @@ def scenario_names(testbed: bool = False) -> list[str]:
     return [*GROUNDS, *(name for name in CHANGES if not (testbed and name in WALKER_ONLY))]
 
 
-def make_scenario(name: "str | Scenario") -> Scenario:
+def make_scenario(name: "str | Scenario", testbed: bool = False) -> Scenario:
     """The scenario of a name such as "nominal", "soft", "ideal+soft" or "soft+payload".
+
+    Args:
+        name: Name, or the scenario itself.
+        testbed: Whether an unknown name is answered with those of the testbed.
 
     Raises:
         ConfigurationError: A part of the name does not exist, a ground stands behind another part, or two changes set
@@ -125,7 +129,7 @@ def make_scenario(name: "str | Scenario") -> Scenario:
         if change in GROUNDS:
             raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
         if change not in CHANGES:
-            raise unknown_name("scenario", change, scenario_names())
+            raise unknown_name("scenario", change, scenario_names(testbed))
         added = CHANGES[change](ground)
         twice = sorted(parameters.keys() & added.keys())
         if twice:
