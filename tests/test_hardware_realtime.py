@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from elastic_env.hardware import realtime
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import FaultError
-from elastic_env.hardware.realtime import Priority, give_up_realtime, prefer_realtime
+from elastic_env.hardware.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.hardware.supervised import SupervisedBus
 from tests.busy import once_more
@@ -104,3 +105,65 @@ def test_goals_are_kept_as_urgently_as_the_loop_commands_them() -> None:
         found = os.sched_getscheduler(keeper.native_id), os.sched_getparam(keeper.native_id).sched_priority
         bus.exchange(np.array(start), time.monotonic())
     assert found == (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority)
+
+
+class Clock:
+    """In the place of the module `time`: stands until it is set."""
+
+    now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(realtime, "time", clock)
+    return clock
+
+
+def paced(clock: Clock, pace: Pace, before_s: float, reading_s: float) -> tuple[float, float]:
+    """A cycle of a loop that needs a while for its command and whose reading waits: when it read, how late that was."""
+    clock.now_s += before_s
+    clock.now_s = max(clock.now_s, pace.next()) + reading_s
+    return clock.now_s, pace.late(clock.now_s)
+
+
+def test_a_loop_that_keeps_up_reads_on_the_grid(clock: Clock) -> None:
+    """Catches readings whose small delays add up: the loop would run below its rate."""
+    pace = Pace(0.004)
+    moments, lateness = np.transpose([paced(clock, pace, 0.002, 1e-4 * (number % 3)) for number in range(30)])
+    delays = 1e-4 * (np.arange(30) % 3)
+    assert moments == pytest.approx(0.004 * np.arange(1, 31) + delays, abs=1e-12)
+    assert lateness == pytest.approx(delays, abs=1e-12)
+
+
+@pytest.mark.parametrize("is_command", [True, False])
+def test_a_short_delay_is_caught_up_with_and_no_overrun(clock: Clock, is_command: bool) -> None:
+    pace = Pace(0.004)
+    delay = (0.0055, 0.0) if is_command else (0.002, 0.0015)
+    (_, first), (moment, second) = paced(clock, pace, *delay), paced(clock, pace, 0.002, 0.0)
+    assert (first, second) == pytest.approx((0.0015, 0.0), abs=1e-12)
+    assert not pace.is_overrun(first)
+    assert moment == pytest.approx(0.008)
+
+
+@pytest.mark.parametrize("is_command", [True, False])
+def test_one_hold_up_is_one_overrun_and_a_whole_period_follows(clock: Clock, is_command: bool) -> None:
+    """Catches a hold-up that counts twice, and a command that has no time to act before the reading after it."""
+    pace = Pace(0.004)
+    delay = (0.0075, 0.0) if is_command else (0.002, 0.0035)
+    (moment, late_s), *after = [paced(clock, pace, *delay), *(paced(clock, pace, 0.0035, 0.0) for _ in range(3))]
+    assert late_s == pytest.approx(0.0035)
+    assert pace.is_overrun(late_s)
+    assert moment == pytest.approx(0.0115 if is_command else 0.0075)
+    assert [at for at, _ in after] == pytest.approx([moment + 0.004 * number for number in (1, 2, 3)])
+    assert [late for _, late in after] == pytest.approx([0.0] * 3, abs=1e-12)
+
+
+def test_a_loop_that_is_always_too_slow_cannot_hide_it(clock: Clock) -> None:
+    """Catches a grid that moves along with every small delay: 4.9 ms for each 4 ms, and never an overrun."""
+    pace = Pace(0.004)
+    overruns = sum(pace.is_overrun(paced(clock, pace, 0.0049, 0.0)[1]) for _ in range(300))
+    assert overruns == pytest.approx(100, abs=1)

@@ -20,7 +20,7 @@ import pytest
 import baselines
 from elastic_env.entry_points import configure_testbed
 from elastic_env.errors import ConfigurationError
-from elastic_env.hardware import plant
+from elastic_env.hardware import plant, realtime
 from elastic_env.hardware.attitude import Attitude, AttitudeError, AttitudeStream, SharedSample, link_angle
 from elastic_env.hardware.bus import States
 from elastic_env.hardware.emulator.config import EmulatorConfig
@@ -256,6 +256,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillBus:
     bus = StillBus()
     monkeypatch.setattr(plant, "SupervisedBus", lambda *_: bus)
     monkeypatch.setattr(plant, "time", bus)
+    monkeypatch.setattr(realtime, "time", bus)
     monkeypatch.setattr(plant, "prefer_realtime", lambda _: None)
     return bus
 

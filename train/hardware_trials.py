@@ -25,7 +25,7 @@ from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
-from elastic_env.hardware.realtime import Priority, give_up_realtime, prefer_realtime, sleep_until
+from elastic_env.hardware.realtime import Pace, Priority, give_up_realtime, prefer_realtime, sleep_until
 from elastic_env.hardware.safety import SafetyLimits
 from elastic_env.hardware.supervised import SupervisedBus
 from elastic_env.tasks.testbed_config import TestbedConfig
@@ -118,7 +118,8 @@ def loop(share: float) -> Trial:
             late["bus"] += lateness
             missed += misses
             bus.disable()
-    overruns = {name: [x for x in values if x > 0.5 * PERIOD_S] for name, values in late.items()}
+    is_overrun = Pace(PERIOD_S).is_overrun
+    overruns = {name: [x for x in values if is_overrun(x)] for name, values in late.items()}
     shares = {name: len(overruns[name]) / len(late[name]) for name in late}
     return Trial(
         "loop", "12 servos at 250 Hz, 1 ms USB latency: at most 0.1 % overruns beyond a loop that only sleeps",
@@ -155,25 +156,21 @@ def _beside_the_program(config: EmulatorConfig) -> Iterator[RunningEmulator]:
 
 
 def _sleep_loop(duration_s: float) -> list[float]:
-    late, due = [], time.monotonic()
+    late, pace = [], Pace(PERIOD_S)
     for _ in range(round(duration_s / PERIOD_S)):
-        due = max(due + PERIOD_S, time.monotonic())
-        sleep_until(due)
-        late.append(time.monotonic() - due)
+        sleep_until(pace.next())
+        late.append(pace.late(time.monotonic()))
     return late
 
 
 def _bus_loop(bus: SupervisedBus, servos: int, duration_s: float) -> tuple[list[float], int]:
-    """How late each cycle was: its reading, or its command where that came after the reading was due."""
+    """How late each period was, and how many had no reply from a servo."""
     late, missed = [], 0
-    begin = due = time.monotonic()
+    begin, pace = time.monotonic(), Pace(PERIOD_S)
     for _ in range(round(duration_s / PERIOD_S)):
-        due += PERIOD_S
-        behind = time.monotonic() - due
-        if behind > 0.0:
-            due += behind
+        due = pace.next()
         cycle = bus.exchange(np.full(servos, 0.3 * goal(due - begin)), due)
-        late.append(max(behind, 0.0) + cycle.late_s)
+        late.append(pace.late(due + cycle.late_s))
         missed += not cycle.states.is_fresh.all()
     return late, missed
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from elastic_env.hardware.attitude import AttitudeStream, link_angle
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.realtime import Priority, give_up_realtime, prefer_realtime
+from elastic_env.hardware.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.supervised import Cycle, SupervisedBus
 from elastic_env.hardware.torque_line import torque_of_current
@@ -29,11 +29,11 @@ class Timing:
     """How well the last control period was kept; counts are of the episode."""
 
     jitter_s: float = 0.0
-    """Moment of the reading after the one it was due at [s]."""
+    """How late the reading was, or the command for it [s]."""
     period_s: float = 0.0
     """Time since the reading before [s]."""
     overruns: int = 0
-    """Periods that were over before the command for them came, or that were read half a period late."""
+    """Periods that were more than half a period late, see `Pace`."""
     missed_replies: int = 0
     """Cycles without a usable reply; the last command was held and the cycle repeated."""
     limited: int = 0
@@ -75,7 +75,8 @@ class ServoPlant:
         self._bus: SupervisedBus | None = None
         self._imu: AttitudeStream | None = None
         self._is_agreed = not settings.confirm
-        self._goal = self._due_s = self._read_s = 0.0
+        self._pace = Pace(period_s)
+        self._goal = self._read_s = 0.0
         self._is_kept = False
 
     def __del__(self) -> None:
@@ -223,27 +224,25 @@ class ServoPlant:
         return np.array([self.settings.servo_angle(angle)])
 
     def _restart_clock(self) -> None:
-        self._due_s = self._read_s = time.monotonic()
+        self._pace.restart()
+        self._read_s = time.monotonic()
 
     def _cycle(self, angle: float) -> None:
         """One control period; where the reply is missing the command is held and the cycle repeated."""
         bus, missed, limited, overruns = self._opened(), 0, False, 0
         while True:
-            self._due_s += self._period_s
-            late_s = time.monotonic() - self._due_s
-            if late_s > 0.0:
-                overruns += 1
-                self._due_s += late_s + self._period_s
-            cycle = bus.exchange(self._servo_goal(angle), self._due_s)
+            due_s = self._pace.next()
+            cycle = bus.exchange(self._servo_goal(angle), due_s)
             limited |= bool(cycle.is_limited.any()) and not cycle.is_held
-            overruns += cycle.late_s > 0.5 * self._period_s
+            late_s = self._pace.late(due_s + cycle.late_s)
+            overruns += self._pace.is_overrun(late_s)
             if cycle.states.is_fresh.all():
                 break
             missed += 1
         self._take(cycle)
         last = self.timing
         self.timing = Timing(
-            jitter_s=cycle.late_s,
+            jitter_s=late_s,
             period_s=cycle.states.time_s - self._read_s,
             overruns=last.overruns + overruns,
             missed_replies=last.missed_replies + missed,

@@ -56,3 +56,48 @@ def sleep_until(moment_s: float) -> None:
     remaining = moment_s - time.monotonic()
     if remaining > 0.0:
         time.sleep(remaining)
+
+
+class Pace:
+    """Moments at which a control loop reads, one period after the other.
+
+    Small delays are caught up with. An overrun is a period whose command comes, or whose reading happens, more than
+    half a period late: a new one begins there, so that one hold-up counts once and what follows has its whole time.
+
+    Args:
+        period_s: Time between readings [s].
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self.restart()
+
+    def restart(self) -> None:
+        """A period begins now."""
+        self._due_s, self._lost_s = time.monotonic(), 0.0
+
+    def next(self) -> float:
+        """When to read, for a command that is ready now: not before now [s, monotonic clock]."""
+        now = time.monotonic()
+        self._due_s += self._period_s
+        self._lost_s = now - self._due_s
+        if not self.is_overrun(self._lost_s):
+            self._lost_s = 0.0
+            return max(self._due_s, now)
+        self._due_s = now + self._period_s
+        return self._due_s
+
+    def late(self, moment_s: float) -> float:
+        """How late the last period was read, or its command came [s].
+
+        Args:
+            moment_s: When it was read [s, monotonic clock].
+        """
+        late_s = moment_s - self._due_s
+        if self.is_overrun(late_s):
+            self._due_s = moment_s
+        return self._lost_s + late_s
+
+    def is_overrun(self, late_s: float) -> bool:
+        """Whether a period was lost that was so late."""
+        return late_s > 0.5 * self._period_s
