@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from elastic_env.compiled import compiled
 from elastic_env.signals import Array, BoolArray, Signals
 
 
@@ -61,12 +62,12 @@ class RunningStatistic:
         """
         fold = _FOLDS[self._name]
         # where, not a product: a nan outside does not count
-        taken = np.where(sampled, fold.taken(values), fold.neutral).swapaxes(0, 1)
+        taken = np.where(sampled, fold.taken(values), fold.neutral)
         self._count += sampled.sum(axis=1)
-        if fold.joined is not np.add:
-            taken = fold.joined.reduce(taken, axis=0, keepdims=True, initial=fold.neutral)
-        for step in taken:  # sums in the order of the steps
-            fold.joined(self._total, step, out=self._total)
+        if fold.joined is np.add:
+            _add_in_order(taken, self._total)
+        else:
+            fold.joined(self._total, fold.joined.reduce(taken, axis=1, initial=fold.neutral), out=self._total)
 
     def values(self) -> Array:
         """The statistic of every row, (num_rows, num_worlds); nan where there was no sample, but for their number."""
@@ -74,6 +75,15 @@ class RunningStatistic:
             return self._total.copy()
         value = self._total / np.maximum(self._count, 1) if self._name in ("rms", "mean") else self._total
         return np.where(self._count > 0, np.sqrt(value) if self._name == "rms" else value, np.nan)
+
+
+@compiled
+def _add_in_order(values: Array, total: Array) -> None:
+    """Add values, (num_rows, num_steps, num_worlds), to a total, (num_rows, num_worlds), step after step."""
+    for row in range(values.shape[0]):
+        for step in range(values.shape[1]):
+            for world in range(values.shape[2]):
+                total[row, world] += values[row, step, world]
 
 
 class EpisodeMetrics:

@@ -25,8 +25,12 @@ def quantise(angle: Array, counts_per_turn: int | None) -> Array:
     """Angle of an encoder with whole counts [rad]; None leaves the angle as it is."""
     if counts_per_turn is None:
         return angle
-    step = 2.0 * np.pi / counts_per_turn
-    return np.rint(angle / step) * step
+    return in_whole_counts(angle, 2.0 * np.pi / counts_per_turn)
+
+
+def in_whole_counts(angle: Array, count_rad: float) -> Array:
+    """The nearest whole counts of an encoder, as an angle [rad]."""
+    return np.rint(angle / count_rad) * count_rad
 
 
 def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Array) -> Array:
@@ -41,10 +45,14 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
     Returns:
         (...) [rad].
     """
-    measured = angle + drawn_bias + sensor.noise_rad * noise
-    if sensor.bias_rad != 0.0 or sensor.sine_error_rad != 0.0:
-        measured += sensor.bias_rad + sensor.sine_error_rad * np.sin(angle)
-    return measured
+    return shown_angle(angle, drawn_bias, noise, sensor.noise_rad, sensor.bias_rad, sensor.sine_error_rad)
+
+
+def shown_angle(
+    angle: Array, drawn_bias: Array, noise: Array, noise_rad: float, bias_rad: float, sine_error_rad: float
+) -> Array:
+    """What an attitude sensor shows of an angle, with the parameters of `AttitudeSensor` [rad]."""
+    return angle + drawn_bias + noise_rad * noise + (bias_rad + sine_error_rad * np.sin(angle))
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:
@@ -77,16 +85,26 @@ class NoiseStream:
 
     def next(self, worlds: BoolArray) -> Array:
         """The next sample of some worlds, (num_worlds, width); the rows of the others are not to be used."""
+        samples, used = self.ready()
+        at = np.minimum(used, len(samples) - 1) * len(self._world) + self._world
+        sample = samples.reshape(-1, samples.shape[2]).take(at, axis=0)
+        used += worlds
+        return sample
+
+    def ready(self) -> tuple[Array, IntArray]:
+        """Samples ahead, at least one of each world, for one step.
+
+        Returns:
+            (block, num_worlds, width), and how many of each world's are used, (num_worlds,): its next one has that
+            number, and counting it is for the caller.
+        """
         block = len(self._samples)
         if self._most_used >= block:
-            for world in np.flatnonzero(worlds & (self._used == block)):
+            for world in np.flatnonzero(self._used == block):
                 self._refill(int(world))
             self._most_used = int(self._used.max())
-        at = np.minimum(self._used, block - 1) * len(self._world) + self._world
-        sample = self._samples.reshape(-1, self._samples.shape[2]).take(at, axis=0)
-        self._used += worlds
         self._most_used += 1
-        return sample
+        return self._samples, self._used
 
     def _refill(self, world: int) -> None:
         self._samples[:, world] = self._generators[world].standard_normal((len(self._samples), self._samples.shape[2]))

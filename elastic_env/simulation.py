@@ -33,6 +33,10 @@ class Simulation(Protocol):
         """
         ...
 
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """Several fields bound."""
+        ...
+
     def vary(self, field: str) -> Array:
         """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now on."""
         ...
@@ -66,6 +70,7 @@ class SingleWorld:
         self.num_worlds = 1
         self._varies = False
         self._data = mujoco.MjData(model)
+        self._warnings, self._views = self._data.warning.number, dict[tuple[str, ...], tuple[Array, ...]]()
         self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
         self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
 
@@ -78,6 +83,12 @@ class SingleWorld:
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
         return getattr(self._data, field)[None]
+
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """See `Simulation`."""
+        if fields not in self._views:
+            self._views[fields] = tuple(self.bind(field) for field in fields)
+        return self._views[fields]
 
     def vary(self, field: str) -> Array:
         """See `Simulation`."""
@@ -101,7 +112,7 @@ class SingleWorld:
 
     def diverged(self) -> BoolArray:
         """See `Simulation`."""
-        return np.array([bool(self._data.warning.number.any())])
+        return np.array([np.count_nonzero(self._warnings) > 0])
 
     def close(self) -> None:
         """See `Simulation`; there is nothing to give back."""
@@ -115,6 +126,7 @@ class ManyWorlds:
         self.num_worlds = num_worlds
         self._varied: set[str] = set()
         self._bound: set[str] = set()
+        self._views: dict[tuple[str, ...], tuple[Array, ...]] = {}
         self._batch = batch.Batch(model, nsim=num_worlds, nthread=min(num_threads or os.cpu_count() or 1, num_worlds))
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
@@ -149,6 +161,12 @@ class ManyWorlds:
         """See `Simulation`."""
         self._bound.add(field)
         return self._batch.bind(field)
+
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """See `Simulation`."""
+        if fields not in self._views:
+            self._views[fields] = tuple(self.bind(field) for field in fields)
+        return self._views[fields]
 
     def vary(self, field: str) -> Array:
         """See `Simulation`."""

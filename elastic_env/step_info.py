@@ -14,6 +14,8 @@ class StepInfo(dict[str, Any]):
         rest: Makes the rest, without any of the given keys; it must not depend on when it is called.
     """
 
+    __slots__ = ("_rest",)
+
     def __init__(self, given: dict[str, Any], rest: Callable[[], dict[str, Any]]) -> None:
         super().__init__(given)
         self._rest: Callable[[], dict[str, Any]] | None = rest

@@ -1,13 +1,14 @@
 """N worlds of one task: the control step that scalar and vector environments share."""
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from elastic_env.compiled import compiled
 from elastic_env.errors import ActionError
 from elastic_env.metrics import EpisodeMetrics
 from elastic_env.rows import Rows
@@ -20,8 +21,7 @@ DIVERGED = "diverged"
 """Reason of termination where the simulation produced a bad number; MuJoCo alone would restart it silently."""
 
 
-@dataclass(frozen=True, slots=True)
-class Transition:
+class Transition(NamedTuple):
     """Result of a control step, one row per world."""
 
     observation: Array
@@ -36,7 +36,7 @@ class Transition:
         return self.terminated | self.truncated
 
 
-_SCORED_ROWS, _FEWEST_STEPS, _MOST_STEPS = 4096, 16, 64
+_SCORED_ROWS, _FEWEST_STEPS, _MOST_STEPS = 4096, 16, 256
 """Rows (steps of all worlds) whose signals are computed together, and how many steps that can be."""
 
 
@@ -66,10 +66,12 @@ class Worlds:
         self._is_scalar = is_scalar
         self.simulation = simulation or simulate(task.model, task.num_worlds, num_threads)
         self._bound = task.action_table.space(np.float32).high.astype(np.float64)
+        self._shape = (task.num_worlds, len(self._bound))
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
-        self._samples: list[_Sample] = []
+        self._samples: list[tuple[Any, ...]] = []  # of `_Sample`s to be
         self._scored_at_once = min(max(_SCORED_ROWS // task.num_worlds, _FEWEST_STEPS), _MOST_STEPS)
-        self._no_reason = _reasons({}, task.num_worlds)
+        self._failures = (DIVERGED, *task.failure_names)
+        self._no_reason = np.full(task.num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
 
     @property
@@ -94,32 +96,30 @@ class Worlds:
         Raises:
             ActionError: Wrong shape, or a value that is not finite.
         """
-        requested = self._checked(action)
-        offset = np.minimum(np.maximum(requested, -self._bound), self._bound)
-        self.simulation.ctrl[:] = self.task.command(offset)
+        offset, is_clipped = self._checked(action)
+        self.task.command(offset, self.simulation.ctrl)
         self.task.disturb(self.simulation)
         self.simulation.advance(self.task.num_substeps)
-        diverged = self.simulation.diverged()
-        self.task.sense(self.simulation, ~diverged)
-        sample = _Sample(self.task.sample(), requested != offset, diverged)
+        observation, of_task, reward, ends, is_over = self.task.sense(self.simulation, self.simulation.diverged())
+        sample = of_task, is_clipped, ends[0]
         self._samples.append(sample)
-        terms = self.task.reward_terms(sample.of_task, diverged)
-        failures = {DIVERGED: diverged, **self.task.failures()}
-        terminated = functools.reduce(np.logical_or, failures.values())
-        truncated = self.task.finished() & ~terminated
-        reason = _reasons(failures, self.num_worlds) if terminated.any() else self._no_reason
-        info = StepInfo({"reward_terms": terms, "termination": reason}, lambda: self._signals(sample))
-        if (terminated | truncated).any():
+        terminated, truncated = ends[-2], ends[-1]
+        reason = self._reasons(ends) if is_over else self._no_reason
+        info = StepInfo({"termination": reason}, partial(self._rest, sample))
+        if is_over:
             self.score_samples()
-            failed = {name: mask.copy() for name, mask in failures.items()}
-            info["episode_metrics"] = {**self._metrics.values(), **failed}
+            info["episode_metrics"] = {**self._metrics.values(), **dict(zip(self._failures, ends, strict=False))}
         elif len(self._samples) >= self._scored_at_once:
             self.score_samples()
-        reward = functools.reduce(np.add, terms.values())
-        return Transition(self.task.observe(), reward, terminated, truncated, info)
+        return Transition(observation, reward, terminated, truncated, info)
+
+    def _rest(self, sample: tuple[Any, ...]) -> dict[str, Any]:
+        """What a step tells of itself when somebody looks at it."""
+        whole = _Sample(*sample)
+        return {"reward_terms": self.task.reward_terms(whole.of_task), **self._signals(whole)}
 
     def _signals(self, sample: "_Sample") -> Signals:
-        clipped = np.asarray(sample.is_clipped.any(axis=1), dtype=np.float64)
+        clipped = sample.is_clipped.astype(np.float64)
         return {**self.task.signals(sample.of_task), "clipped": clipped}
 
     def score_samples(self) -> None:
@@ -127,7 +127,7 @@ class Worlds:
         if not self._samples:
             return
         shape = (len(self._samples), self.num_worlds)
-        joined = _Sample.joined(self._samples)
+        joined = _Sample.joined([_Sample(*sample) for sample in self._samples])
         self._samples = []
         masks = self.task.masks(joined.of_task)
         if joined.diverged.any():
@@ -136,18 +136,26 @@ class Worlds:
         signals = {name: signal.reshape(shape) for name, signal in self._signals(joined).items()}
         self._metrics.update(signals, {name: mask.reshape(shape) for name, mask in masks.items()})
 
-    def _checked(self, action: npt.ArrayLike) -> Array:
+    def _checked(self, action: npt.ArrayLike) -> tuple[Array, BoolArray]:
+        """Offsets within the bounds, and where an action was beyond them, (num_worlds,)."""
         given = np.asarray(action)
-        if given.dtype.kind not in "fiub" or given.shape != (self.num_worlds, len(self._bound)):
+        if given.dtype.kind not in "fiub" or given.shape != self._shape:
             raise self._refused(given)
-        values = given.astype(np.float64)
-        if not np.isfinite(values).all():
-            raise self._refused(values)
-        return values
+        offset, is_clipped = given.astype(np.float64), np.empty(len(given), dtype=np.bool_)
+        if not _clip(offset, self._bound, is_clipped):
+            raise self._refused(given)
+        return offset, is_clipped
+
+    def _reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
+        """Reason of termination of every world, the first that applies, "" where there is none."""
+        reasons = np.full(self.num_worlds, "", dtype=f"<U{max(map(len, self._failures))}")
+        for reason, failed in reversed([*zip(self._failures, ends, strict=False)]):
+            reasons[failed] = reason
+        return reasons
 
     def _refused(self, given: npt.NDArray[Any]) -> ActionError:
         """What is wrong with an action."""
-        shape, bounds = (self.num_worlds, len(self._bound)), f"within ±{self._bound.max():g} rad"
+        shape, bounds = self._shape, f"within ±{self._bound.max():g} rad"
         if given.dtype.kind not in "fiub":
             return ActionError(f"an action must be real numbers, {bounds}, got an array of {given.dtype}")
         if given.shape != shape:
@@ -160,9 +168,16 @@ class Worlds:
         )
 
 
-def _reasons(failures: dict[str, BoolArray], num_worlds: int) -> npt.NDArray[np.str_]:
-    """Reason of termination of every world, the first that applies, "" where there is none."""
-    reasons = np.full(num_worlds, "", dtype=f"<U{max(map(len, failures), default=1)}")
-    for reason, failed in reversed(failures.items()):
-        reasons[failed] = reason
-    return reasons
+@compiled
+def _clip(action: Array, bound: Array, is_clipped: BoolArray) -> bool:
+    """Bring actions within their bounds, and mark the rows that were beyond; False where a number is not finite."""
+    for row in range(len(action)):
+        is_clipped[row] = False
+        for i in range(len(bound)):
+            value = action[row, i]
+            if not np.isfinite(value):
+                return False
+            action[row, i] = min(max(value, -bound[i]), bound[i])
+            if action[row, i] != value:
+                is_clipped[row] = True
+    return True

@@ -214,7 +214,7 @@ class Walker:
             config=walk.config,
             plan=walk.plan,
             truth=lambda: self.truth,
-            failures=lambda: {"fell": np.array([self.fell])},
+            has_fallen=lambda: np.array([self.fell]),
         )
         self.picture = WalkerPicture(task)
 

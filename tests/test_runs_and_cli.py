@@ -34,7 +34,7 @@ from tests.test_identification import synthetic
 from train.cli import main
 from train.compare import CompareConfig
 from train.conditions import Condition, PolicySpec
-from train.contenders import RawWorlds, VectorLoop
+from train.contenders import RawWorlds, ScalarLoop, VectorLoop
 from train.evaluate import Evaluation, evaluate
 from train.play import play
 from train.runs import new_run, run_folder
@@ -594,12 +594,12 @@ def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture
     found = [(r["contender"], r["num_envs"], r["against"]) for r in results]
     loops = ["vector env", "raw mj_step", "vector env with input", "vector env with input and residual network"]
     assert found[:8] == [(loop, n, f"raw mj_step, {n}") for n in (4, 2) for loop in loops]
-    assert found[8:10] == [(name, 1, "plain mj_step loop, 1") for name in ("plain mj_step loop", "scalar env")]
+    assert found[8:10] == [(name, 1, "raw mj_step, 1") for name in ("scalar env", "raw mj_step")]
     others = ["Gymnasium AsyncVectorEnv", "SB3 SubprocVecEnv", "Gymnasium SyncVectorEnv", "SB3 DummyVecEnv"]
     assert found[10:] == [(name, 1, "vector env, 4") for name in others]
     for result in results:
         assert min(result["steps_per_s"], result["ratio"]) > 0.0
-        assert result["contender"] not in ("raw mj_step", "plain mj_step loop") or result["ratio"] == 1.0
+        assert result["contender"] != "raw mj_step" or result["ratio"] == 1.0
     assert "predict" in Path("runs/speed/profile.txt").read_text()
     assert "runs/speed/speed.json" in capsys.readouterr().out
 
@@ -614,10 +614,12 @@ def test_speed_of_learning_end_to_end() -> None:
     assert 0.0 < processes["ratio"] < 1.0
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_raw_stepping_does_the_work_of_the_environment(residual: bool) -> None:
+@pytest.mark.parametrize("kind", ["policy", "residual", "scalar"])
+def test_raw_stepping_does_the_work_of_the_environment(kind: str) -> None:
     """Catches a benchmark that compares unequal work: the raw worlds must end where the environment's end, exactly."""
-    loop = VectorLoop("testbed", 3, 1, "input", residual=residual)
+    loop = (
+        ScalarLoop("walker") if kind == "scalar" else VectorLoop("testbed", 3, 1, "input", residual=kind == "residual")
+    )
     inside = loop.env.unwrapped
     raw = RawWorlds(loop, threads=2)
     loop.run(300)

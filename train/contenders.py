@@ -81,16 +81,44 @@ class VectorLoop:
         self.env.close()
 
 
+class ScalarLoop:
+    """Our scalar environment under zero offsets, without Gymnasium's checks; keeps the servo inputs of its last run."""
+
+    title, num_envs = "scalar env", 1
+
+    def __init__(self, env: str) -> None:
+        self.env: Any = _make(env).unwrapped
+        self._action = np.zeros(self.env.action_space.shape or (), dtype=np.float32)
+        self.env.reset(seed=0)
+        self.controls = np.empty((0, *self.env.simulation.ctrl.shape))
+
+    def run(self, steps: int) -> float:
+        """See `Contender`."""
+        ctrl = self.env.simulation.ctrl
+        self.controls = np.empty((steps, *ctrl.shape))
+        begin = time.perf_counter()
+        for step in range(steps):
+            _, _, terminated, truncated, _ = self.env.step(self._action)
+            self.controls[step] = ctrl
+            if terminated or truncated:
+                self.env.reset()
+        return steps / (time.perf_counter() - begin)
+
+    def close(self) -> None:
+        """See `Contender`."""
+        self.env.close()
+
+
 class RawWorlds:
     """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm in its cache.
 
-    It starts from the states of a vector environment and plays the servo inputs of its last run: on a thread nothing
+    It starts from the states of an environment and plays the servo inputs of its last run: on a thread nothing
     but writing `ctrl` and one call of `mj_step` with all sub-steps of a control period.
     """
 
     title = "raw mj_step"
 
-    def __init__(self, loop: VectorLoop, threads: int) -> None:
+    def __init__(self, loop: VectorLoop | ScalarLoop, threads: int) -> None:
         task, simulation = loop.env.unwrapped.task, loop.env.unwrapped.simulation
         self._loop, self.num_envs = loop, loop.num_envs
         self._model, self._substeps = task.model, task.num_substeps
@@ -98,7 +126,7 @@ class RawWorlds:
         self.states = np.stack([self._state_of(simulation, world) for world in range(self.num_envs)])
 
     def run(self, steps: int) -> float:
-        """See `Contender`; as many steps as the vector environment played last."""
+        """See `Contender`; as many steps as the environment played last."""
         return self.num_envs * steps / self.play(self._loop.controls)
 
     def play(self, controls: Array) -> float:
@@ -133,55 +161,6 @@ class RawWorlds:
         data.qacc_warmstart[:] = simulation.bind("qacc_warmstart")[world]
         mujoco.mj_getState(self._model, data, state, _STATE)
         return state
-
-
-class ScalarLoop:
-    """Our scalar environment under zero offsets, without Gymnasium's checks around it."""
-
-    title, num_envs = "scalar env", 1
-
-    def __init__(self, env: str) -> None:
-        self._env = _make(env).unwrapped
-        self._action = np.zeros(self._env.action_space.shape or (), dtype=np.float32)
-        self._env.reset(seed=0)
-
-    def run(self, steps: int) -> float:
-        """See `Contender`."""
-        begin = time.perf_counter()
-        for _ in range(steps):
-            _, _, terminated, truncated, _ = self._env.step(self._action)
-            if terminated or truncated:
-                self._env.reset()
-        return steps / (time.perf_counter() - begin)
-
-    def close(self) -> None:
-        """See `Contender`."""
-        self._env.close()
-
-
-class PlainLoop:
-    """A loop of `mj_step` over one world on one thread, from the same start, holding its first servo inputs."""
-
-    title, num_envs = "plain mj_step loop", 1
-
-    def __init__(self, env: str) -> None:
-        made: Any = _make(env).unwrapped
-        made.reset(seed=0)
-        self._model, self._substeps = made.task.model, made.task.num_substeps
-        self._data = mujoco.MjData(self._model)
-        simulation = made.simulation
-        self._data.qpos[:], self._data.qvel[:] = simulation.qpos[0], simulation.qvel[0]
-        self._data.act[:], self._data.ctrl[:] = simulation.act[0], simulation.ctrl[0]
-
-    def run(self, steps: int) -> float:
-        """See `Contender`."""
-        begin = time.perf_counter()
-        for _ in range(steps):
-            mujoco.mj_step(self._model, self._data, self._substeps)
-        return steps / (time.perf_counter() - begin)
-
-    def close(self) -> None:
-        """See `Contender`."""
 
 
 class _ForeignLoop:

@@ -18,7 +18,6 @@ from elastic_env.config import Model, quantity
 from train.contenders import (
     Contender,
     GymnasiumLoop,
-    PlainLoop,
     PPOLoop,
     RawWorlds,
     SB3Loop,
@@ -119,8 +118,8 @@ def _entries(config: SpeedConfig) -> list[_Entry]:
         entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy), raw))
         entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy, residual=True), raw))
     if config.others:
-        plain = len(entries)
-        entries += [_Entry(PlainLoop(env), plain), _Entry(ScalarLoop(env), plain)]
+        scalar, raw = ScalarLoop(env), len(entries) + 1
+        entries += [_Entry(scalar, raw), _Entry(RawWorlds(scalar, 1), raw)]
         for count in config.processes:
             entries.append(_Entry(GymnasiumLoop(env, "async", count), 0))
             entries.append(_Entry(SB3Loop(env, "SubprocVecEnv", count), 0))

@@ -161,6 +161,10 @@ class ServoPlant:
         """
         raise HardwareError(f"hardware has no {field!r} of MuJoCo")
 
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """See `elastic_env.simulation.Simulation`."""
+        return tuple(self.bind(field) for field in fields)
+
     def vary(self, field: str) -> Array:
         """Hardware cannot be varied.
 

@@ -24,6 +24,7 @@ from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.metrics import Metric
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.simulation import Simulation
+from elastic_env.tasks.task import Outcome
 from elastic_env.tasks.testbed import METRICS, Measurement, TestbedSample, TestbedTask, TestbedTruth
 from elastic_env.tasks.testbed_config import TestbedConfig
 
@@ -83,12 +84,13 @@ class HardwareTestbedTask(TestbedTask):
         at_rest = Measurement(self._theta, self._theta, self._q)
         self._measured = self._shown = at_rest
 
-    def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
+    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
         """Take the new measurements; behind the last step the pendulum is brought to rest."""
-        super().sense(simulation, healthy)
         self._read_plant()  # before the way back to rest, which measures too
-        if self.finished().all():
+        outcome = super().sense(simulation, diverged)
+        if outcome.is_over:
             self.plant.finish()
+        return outcome
 
     def sample(self) -> HardwareSample:
         """See `TestbedTask`."""

@@ -29,6 +29,7 @@ from elastic_env.robots.thormang import LEG_JOINTS
 from elastic_env.signals import Array, Signals
 from elastic_env.tasks.walk_in_place import WalkTask
 from elastic_env.tasks.walk_state import WalkTruth
+from elastic_env.tasks.walk_tables import FELL
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import shares
 from elastic_env.walking.gait import LEFT
@@ -137,7 +138,7 @@ class WalkerPicture(ModelPicture):
 
     def _caption(self, signals: Signals) -> list[str]:
         now = {name: float(values[0]) for name, values in signals.items()}
-        failures = [name for name, failed in self._task.failures().items() if failed[0]]
+        failures = [FELL] if self._task.has_fallen()[0] else []
         deviation = now["zmp_deviation"]
         zmp = "no ground contact" if np.isnan(deviation) else f"ZMP deviation {1e3 * deviation:5.1f} mm"
         return [

@@ -1,7 +1,7 @@
 """What a task is: the rules of one environment on (num_worlds, ...) arrays, without any loop over worlds."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -12,10 +12,28 @@ from elastic_env.signals import Array, BoolArray, Signals, SignalTable
 from elastic_env.simulation import Simulation
 
 
+class Outcome(NamedTuple):
+    """What a control step came to, one column or row per world.
+
+    Attributes:
+        observation: (num_worlds, len(observation_table)).
+        sample: What signals and masks need of this step, `elastic_env.rows.Rows` that nothing changes later.
+        reward: (num_worlds,).
+        ends: Whether the world diverged, failed by each of `Task.failure_names`, and is terminated and truncated.
+        is_over: Whether any world is.
+    """
+
+    observation: Array
+    sample: Any
+    reward: Array
+    ends: BoolArray
+    is_over: bool
+
+
 class Task(Protocol):
     """Rules of an environment, driven by `elastic_env.worlds.Worlds` in this order every control step.
 
-    command → disturb → (physics) → sense → sample, reward_terms, failures, finished → observe
+    command → disturb → (physics) → sense
 
     What a step is scored by is kept in a sample, of which signals and masks are made when they are needed: together for
     many steps, whose samples are joined.
@@ -28,6 +46,7 @@ class Task(Protocol):
     observation_table: SignalTable
     action_table: SignalTable
     metrics: Sequence[Metric]
+    failure_names: tuple[str, ...]
     assumed_model: RobotModel
 
     @property
@@ -39,44 +58,36 @@ class Task(Protocol):
         """Begin new episodes in some worlds, a (num_worlds,) mask; one generator for every world of the batch."""
         ...
 
-    def command(self, offset: Array) -> Array:
-        """Servo inputs for command offsets, (num_worlds, n) [rad], already within bounds; ctrl, (num_worlds, nu)."""
+    def command(self, offset: Array, inputs: Array) -> None:
+        """Command offsets, (num_worlds, n) [rad], already within bounds, as inputs of the servos, (num_worlds, nu)."""
         ...
 
     def disturb(self, simulation: Simulation) -> None:
         """Apply what acts on the robot from outside during the coming control period."""
         ...
 
-    def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
-        """Take truth and measurements of the new state; worlds that are not healthy, having diverged, keep theirs."""
+    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
+        """Take truth and measurements of the new state, which worlds that diverged do not have; score it."""
         ...
 
     def observe(self) -> Array:
-        """A fresh observation, (num_worlds, len(observation_table))."""
+        """A fresh observation of the present state, (num_worlds, len(observation_table))."""
         ...
 
     def sample(self) -> Any:
-        """What signals and masks need of this step, `elastic_env.rows.Rows` that nothing changes later."""
+        """As `Outcome.sample`, of the present state."""
         ...
 
     def signals(self, sample: Any) -> Signals:
         """Truth and scores of samples by name, one value per row."""
         ...
 
+    def reward_terms(self, sample: Any) -> dict[str, Array]:
+        """Weighted terms whose sum is the reward, one value per row."""
+        ...
+
     def masks(self, sample: Any) -> dict[str, BoolArray]:
         """Samples that count in the metrics, "scored", and the parts of them that the metrics name, by row."""
-        ...
-
-    def reward_terms(self, sample: Any, diverged: BoolArray) -> dict[str, Array]:
-        """Weighted terms whose sum is the reward, (num_worlds,) each."""
-        ...
-
-    def finished(self) -> BoolArray:
-        """Worlds whose plan has come to its end."""
-        ...
-
-    def failures(self) -> dict[str, BoolArray]:
-        """Worlds that failed, by reason."""
         ...
 
     def truth(self) -> Any:

@@ -48,6 +48,7 @@ from elastic_env.rows import Rows
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
 from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
 from elastic_env.simulation import Simulation, substeps
+from elastic_env.tasks.task import Outcome
 from elastic_env.tasks.testbed_config import TestbedConfig, require_feasible
 
 ACTION_BOUND_RAD = 0.3
@@ -115,6 +116,7 @@ class TestbedSample(Rows):
         imu: Link angle as the IMU shows it [rad].
         servo_error: θ_cmd − θ [rad].
         command_rate: Rate of change of the offset [rad/s].
+        diverged: Whether the world has no new state.
     """
 
     __test__ = False
@@ -130,6 +132,7 @@ class TestbedSample(Rows):
     imu: Array
     servo_error: Array
     command_rate: Array
+    diverged: BoolArray
 
 
 def tracking_penalty(link_error: Array) -> Array:
@@ -155,6 +158,7 @@ class TestbedTask:
     name = "testbed"
     action_table = ACTION
     metrics: Sequence[Metric] = METRICS
+    failure_names: tuple[str, ...] = ()  # a pendulum cannot fall over
 
     def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
         require_feasible(config)
@@ -174,6 +178,7 @@ class TestbedTask:
         self._measured = self._shown = Measurement(*np.zeros((3, num_worlds)))
         self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds))
         self._offset, self._offset_before, self._command = np.zeros((3, num_worlds))
+        self._diverged = np.zeros(num_worlds, dtype=np.bool_)
 
     @property
     def num_steps(self) -> int:
@@ -189,7 +194,7 @@ class TestbedTask:
             self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0)
             self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
-        self._step = np.where(worlds, 0, self._step)
+        self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
         self._offset[worlds] = self._offset_before[worlds] = 0.0
         self._command[worlds] = self._reference.at(self._step).q[worlds]
         self._place(simulation, worlds)
@@ -199,21 +204,26 @@ class TestbedTask:
         self._measured = self._measured.with_worlds(worlds, at_rest)
         self._shown = self._shown.with_worlds(worlds, at_rest)
 
-    def command(self, offset: Array) -> Array:
+    def command(self, offset: Array, inputs: Array) -> None:
         """θ_cmd = q_ref + offset, as the servo gets it: it knows its angle only up to the homing error."""
         self._offset_before, self._offset = self._offset, offset[:, 0].copy()
         self._command = self._reference.at(self._step + 1).q + self._offset
-        return (self._command - self._encoder_bias)[:, None]
+        inputs[:, 0] = self._command - self._encoder_bias
 
     def disturb(self, simulation: Simulation) -> None:
         """Nothing pushes the testbed."""
 
-    def sense(self, simulation: Simulation, healthy: BoolArray) -> None:
-        """Read the new state, then what the sensors show of it."""
-        self._step = self._step + 1
-        self._read(simulation, healthy)
-        before, self._measured = self._measured, self._measure(healthy)
+    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
+        """Read the new state, then what the sensors show of it; score it."""
+        self._step, self._diverged = self._step + 1, diverged
+        self._read(simulation, ~diverged)
+        before, self._measured = self._measured, self._measure(~diverged)
         self._shown = before if self.config.scenario.delay_steps else self._measured
+        sample = self.sample()
+        ends = np.array([diverged, diverged, (self._step >= self.num_steps) & ~diverged])
+        terms = self.reward_terms(sample)
+        reward = terms["link_error"] + terms["command_rate"] + terms["divergence"]
+        return Outcome(self.observe(), sample, reward, ends, bool(ends.any()))
 
     def observe(self) -> Array:
         """See the table of the module."""
@@ -232,7 +242,7 @@ class TestbedTask:
         command_rate = (self._offset - self._offset_before) / self.config.control_period_s
         return TestbedSample(
             self._step, reference.q, reference.scored, reference.rest, self._theta, self._theta_dot, self._q,
-            self._q_dot, self._shown.imu, servo_error, command_rate,
+            self._q_dot, self._shown.imu, servo_error, command_rate, self._diverged,
         )  # fmt: skip
 
     def signals(self, sample: TestbedSample) -> Signals:
@@ -256,22 +266,14 @@ class TestbedTask:
         """Windows at rest of `hold`; all but standing and onset of the other references."""
         return {"scored": sample.scored}
 
-    def reward_terms(self, sample: TestbedSample, diverged: BoolArray) -> dict[str, Array]:
+    def reward_terms(self, sample: TestbedSample) -> dict[str, Array]:
         """Weighted penalties for link error, restless commands and divergence."""
         weights = self.config.reward
         return {
             "link_error": weights.link_error * tracking_penalty(sample.q_ref - sample.q),
             "command_rate": weights.command_rate * smoothness_penalty(sample.command_rate),
-            "divergence": weights.divergence * divergence_penalty(diverged),
+            "divergence": weights.divergence * divergence_penalty(sample.diverged),
         }
-
-    def finished(self) -> BoolArray:
-        """The reference has come to its end."""
-        return self._step >= self._reference.num_steps
-
-    def failures(self) -> dict[str, BoolArray]:
-        """A pendulum cannot fall over."""
-        return {}
 
     def truth(self) -> TestbedTruth:
         """State without noise, and the true parameters."""

@@ -1,17 +1,38 @@
-"""State and measurements of the walkers of a batch, one row per world."""
+"""The walker's truth and measurements, one row per world: which column of an array is what."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from elastic_env.compiled import compiled
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.robots.thormang import LEG_JOINTS
 from elastic_env.rows import Rows
 from elastic_env.signals import Array, IntArray
 
-_JOINTS, _WRENCHES = len(LEG_JOINTS), 12
-ATTITUDE, RATE, WRENCH = slice(0, 2), slice(2, 5), slice(5, 17)
-"""Columns of what the body's sensors measure."""
+JOINTS = len(LEG_JOINTS)
+
+
+def _begins(*widths: int) -> list[int]:
+    """Where groups of columns begin that stand side by side, and where the last one ends."""
+    return [sum(widths[:i]) for i in range(len(widths) + 1)]
+
+
+# columns where groups begin, as single numbers: compiled code takes them for constants
+THETA, Q, PELVIS, QUATERNION, POSITION_END = _begins(JOINTS, JOINTS, 3, 4)
+THETA_DOT, Q_DOT, PELVIS_RATE, VELOCITY_END = (POSITION_END + i for i in _begins(JOINTS, JOINTS, 3))
+ATTITUDE, ANKLES, WRENCH, FORCE, ZMP, SERVO_TORQUE, STATE_END = (
+    VELOCITY_END + i for i in _begins(3, 6, 12, 2, 2, JOINTS)
+)
+STIFFNESS, OFFSET, COMMAND, COMMAND_RATE, STEP, CONTACT_SINCE, TRUTH_END = (
+    STATE_END + i for i in _begins(JOINTS, JOINTS, JOINTS, 1, 1, 1)
+)
+ENCODER, ENCODER_BEFORE, IMU_ATTITUDE, GYRO, SENSORS, SCORES = (
+    TRUTH_END + i for i in _begins(JOINTS, JOINTS, 2, 3, 12)
+)
+REWARD_TERMS = ("tilt", "zmp", "effort", "smoothness", "fall")
+RECORD_END = SCORES + len(REWARD_TERMS)
 
 
 @dataclass(frozen=True)
@@ -39,113 +60,97 @@ class WalkTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class WalkState(Rows):
-    """The true state, n rows.
+class WalkRecord(Rows):
+    """What is true of a control step, what is measured, and how it scores, n rows.
 
     Attributes:
-        position: Motor side, link side, and pose of the pelvis, (n, 31), see the properties.
-        velocity: Motor side, link side, and angular velocity of the pelvis, (n, 27), see the properties.
-        attitude: Roll, pitch and tilt of the pelvis, (n, 3) [rad].
-        ankles: Positions of the ankles, (n, 2, 3) [m].
-        wrench: Force and moment of both feet on their legs, in the frames of the feet, (n, 12) [N], [N·m].
-        force: Vertical force of the ground on both feet, (n, 2) [N].
-        zmp: (n, 2) [m], nan where the feet are not loaded.
-        servo_torque: (n, 12) [N·m].
+        values: (n, RECORD_END), see the properties.
     """
 
-    position: Array
-    velocity: Array
-    attitude: Array
-    ankles: Array
-    wrench: Array
-    force: Array
-    zmp: Array
-    servo_torque: Array
-
-    @classmethod
-    def zeros(cls, n: int) -> "WalkState":
-        """A state to be overwritten."""
-        return cls(
-            position=np.zeros((n, 2 * _JOINTS + 7)), velocity=np.zeros((n, 2 * _JOINTS + 3)),
-            attitude=np.zeros((n, 3)), ankles=np.zeros((n, 2, 3)), wrench=np.zeros((n, _WRENCHES)),
-            force=np.zeros((n, 2)), zmp=np.zeros((n, 2)), servo_torque=np.zeros((n, _JOINTS)),
-        )  # fmt: skip
+    values: Array
 
     @property
     def theta(self) -> Array:
         """Motor side, (n, 12) [rad]."""
-        return self.position[:, :_JOINTS]
+        return self._joints(THETA)
 
     @property
     def q(self) -> Array:
         """Link side, (n, 12) [rad]."""
-        return self.position[:, _JOINTS : 2 * _JOINTS]
+        return self._joints(Q)
 
     @property
     def pelvis(self) -> Array:
         """Position of the pelvis, (n, 3) [m]."""
-        return self.position[:, 2 * _JOINTS : 2 * _JOINTS + 3]
+        return self.values[:, PELVIS:QUATERNION]
 
     @property
     def quaternion(self) -> Array:
         """Orientation of the pelvis, w, x, y, z, (n, 4)."""
-        return self.position[:, 2 * _JOINTS + 3 :]
+        return self.values[:, QUATERNION:POSITION_END]
 
     @property
     def theta_dot(self) -> Array:
         """Rate of the motor side, (n, 12) [rad/s]."""
-        return self.velocity[:, :_JOINTS]
+        return self._joints(THETA_DOT)
 
     @property
     def q_dot(self) -> Array:
         """Rate of the link side, (n, 12) [rad/s]."""
-        return self.velocity[:, _JOINTS : 2 * _JOINTS]
+        return self._joints(Q_DOT)
 
     @property
-    def rate(self) -> Array:
-        """Angular velocity of the pelvis in its own frame, (n, 3) [rad/s]."""
-        return self.velocity[:, 2 * _JOINTS :]
+    def attitude(self) -> Array:
+        """Roll, pitch and tilt of the pelvis, (n, 3) [rad]."""
+        return self.values[:, ATTITUDE:ANKLES]
 
+    @property
+    def ankles(self) -> Array:
+        """Positions of the ankles, (n, 2, 3) [m]."""
+        return self.values[:, ANKLES:WRENCH].reshape(-1, 2, 3)
 
-@dataclass(frozen=True, slots=True)
-class WalkMeasurement(Rows):
-    """Sensor values, n rows.
+    @property
+    def force(self) -> Array:
+        """Vertical force of the ground on both feet, (n, 2) [N]."""
+        return self.values[:, FORCE:ZMP]
 
-    Attributes:
-        encoder, encoder_before: Now and a control period earlier, (n, 12) [rad].
-        body: IMU attitude and rate, and foot wrenches, (n, 17), in the columns `ATTITUDE`, `RATE` and `WRENCH`.
-    """
+    @property
+    def zmp(self) -> Array:
+        """ZMP, (n, 2) [m], nan where the feet are not loaded."""
+        return self.values[:, ZMP:SERVO_TORQUE]
 
-    encoder: Array
-    encoder_before: Array
-    body: Array
+    @property
+    def servo_torque(self) -> Array:
+        """Torque of the servos, (n, 12) [N·m]."""
+        return self._joints(SERVO_TORQUE)
 
-    @classmethod
-    def zeros(cls, n: int) -> "WalkMeasurement":
-        """A measurement to be overwritten."""
-        encoder, before = np.zeros((2, n, _JOINTS))
-        return cls(encoder, before, np.zeros((n, WRENCH.stop)))
+    @property
+    def stiffness(self) -> Array:
+        """True K, (n, 12) [N·m/rad]."""
+        return self._joints(STIFFNESS)
 
+    @property
+    def command_rate(self) -> Array:
+        """Rate of change of the command offsets, rms over the joints, (n,) [rad/s]."""
+        return self.values[:, COMMAND_RATE]
 
-@dataclass(frozen=True, slots=True)
-class WalkSample(Rows):
-    """What a step is scored by, n rows.
+    @property
+    def step(self) -> IntArray:
+        """Control steps since the start of the episode, (n,)."""
+        return self.values[:, STEP].astype(np.int64)
 
-    Attributes:
-        step: Control steps since the start of the episode, (n,).
-        state: The true state.
-        offset, offset_before: Command offsets of the last control period and of the one before, (n, 12) [rad].
-        stiffness: True K, (n, 12) [N·m/rad].
-        contact_since: Step in which the swing foot first touched in the second half of its swing, (n,); negative where
-            it has not.
-    """
+    @property
+    def contact_since(self) -> IntArray:
+        """Step in which the swing foot first touched in the second half of its swing, (n,); negative if it has not."""
+        return self.values[:, CONTACT_SINCE].astype(np.int64)
 
-    step: IntArray
-    state: WalkState
-    offset: Array
-    offset_before: Array
-    stiffness: Array
-    contact_since: IntArray
+    @property
+    def scores(self) -> Array:
+        """Terms of the reward by `REWARD_TERMS`, (n, 5)."""
+        return self.values[:, SCORES:RECORD_END]
+
+    def _joints(self, begin: int) -> Array:
+        return self.values[:, begin : begin + JOINTS]
 
 
 def highest(values: Array) -> Array:
@@ -168,13 +173,15 @@ def rotation_of(quaternion: Array) -> Array:
     return R
 
 
+@compiled
 def attitude_of(quaternion: Array) -> Array:
     """Roll and pitch (of yaw, pitch, roll) and the angle between z axis and vertical, (n, 4) to (n, 3) [rad]."""
-    w, x, y, z = quaternion.T
-    # the vertical in the frame of the pelvis
-    up_x, up_y, up_z = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
-    attitude = np.empty((3, len(quaternion)))
-    np.arctan2(up_y, up_z, out=attitude[0])
-    np.arcsin(np.minimum(np.maximum(-up_x, -1.0), 1.0), out=attitude[1])
-    np.arctan2(np.hypot(up_x, up_y), up_z, out=attitude[2])
-    return attitude.T
+    attitude = np.empty((len(quaternion), 3))
+    for row in range(len(quaternion)):
+        w, x, y, z = quaternion[row, 0], quaternion[row, 1], quaternion[row, 2], quaternion[row, 3]
+        # the vertical in the frame of the pelvis
+        up_x, up_y, up_z = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+        attitude[row, 0] = math.atan2(up_y, up_z)
+        attitude[row, 1] = math.asin(min(max(-up_x, -1.0), 1.0))
+        attitude[row, 2] = math.atan2(math.hypot(up_x, up_y), up_z)
+    return attitude

@@ -6,7 +6,7 @@ Compare within a group of one run only. `elastic speed` interleaves the same con
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from train.contenders import PlainLoop, RawWorlds, ScalarLoop, VectorLoop
+from train.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 STEPS = 20
 CASES = [
@@ -54,8 +54,10 @@ def test_vector_env_with_residual(benchmark: BenchmarkFixture, case: tuple[str, 
 
 
 @pytest.mark.parametrize("env", ["walker", "testbed"])
-@pytest.mark.parametrize("contender", [PlainLoop, ScalarLoop])
-def test_one_world(benchmark: BenchmarkFixture, env: str, contender: type[PlainLoop] | type[ScalarLoop]) -> None:
-    """The scalar environment and a plain loop of mj_step."""
+@pytest.mark.parametrize("is_raw", [True, False])
+def test_one_world(benchmark: BenchmarkFixture, env: str, is_raw: bool) -> None:
+    """The scalar environment, and a loop of mj_step with its servo inputs."""
     benchmark.group = f"{env}, one world"
-    benchmark(contender(env).run, STEPS)
+    loop = ScalarLoop(env)
+    loop.run(STEPS)
+    benchmark(RawWorlds(loop, 1).run if is_raw else loop.run, STEPS)
