@@ -6,7 +6,9 @@ that a row's result does not depend on how many rows there are.
 """
 
 import functools
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -22,7 +24,24 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     # as in NumPy, what is divided by zero is infinite or nan
     made: Any = numba.njit(error_model="numpy")(function)
     made._cache = _Cache(function)
+    made.compile = _beside_the_main_thread(made.compile)
     return made
+
+
+def _beside_the_main_thread(compile_: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Compile, or load, in a thread of its own.
+
+    The compiler calls back from C code, where the exception of a signal such as Ctrl-C would be lost; those are raised
+    in the main thread, and only there.
+    """
+
+    def compile_beside(signature: Any) -> Any:
+        if threading.current_thread() is not threading.main_thread():
+            return compile_(signature)
+        with ThreadPoolExecutor(max_workers=1) as beside:
+            return beside.submit(compile_, signature).result()
+
+    return compile_beside
 
 
 class _Cache(FunctionCache):

@@ -87,13 +87,18 @@ def _add_in_order(values: Array, total: Array) -> None:
 
 
 class EpisodeMetrics:
-    """The metrics of a task, accumulated step by step in every world."""
+    """The metrics of a task, accumulated step by step in every world.
+
+    What it compiles it compiles now: a motion of hardware cannot wait for the compiler.
+    """
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
         self._names = [metric.name for metric in metrics]
         by_statistic = {name: [m for m in metrics if m.statistic == name] for name in _FOLDS}
         self._metrics = {name: own for name, own in by_statistic.items() if own}
         self._statistics = {name: RunningStatistic(name, len(m), num_worlds) for name, m in self._metrics.items()}
+        none = np.zeros((1, num_worlds))
+        self.update({m.signal: none for m in metrics}, {m.over: none.astype(np.bool_) for m in metrics})
 
     def restart(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds, (num_worlds,) mask."""

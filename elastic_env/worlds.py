@@ -73,6 +73,7 @@ class Worlds:
         self._failures = (DIVERGED, *task.failure_names)
         self._no_reason = np.full(task.num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
+        self._checked(np.zeros(self._shape))  # compiles now what the first step of a motion could not wait for
 
     @property
     def num_worlds(self) -> int:
@@ -141,7 +142,7 @@ class Worlds:
         given = np.asarray(action)
         if given.dtype.kind not in "fiub" or given.shape != self._shape:
             raise self._refused(given)
-        offset, is_clipped = given.astype(np.float64), np.empty(len(given), dtype=np.bool_)
+        offset, is_clipped = given.astype(np.float64, order="C"), np.empty(len(given), dtype=np.bool_)
         if not _clip(offset, self._bound, is_clipped):
             raise self._refused(given)
         return offset, is_clipped

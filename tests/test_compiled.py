@@ -2,6 +2,9 @@
 
 import copy
 import importlib.util
+import signal
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,6 +59,32 @@ def test_the_stamp_of_the_package_changes_with_a_module_that_is_called(monkeypat
     names = [name for name, _, _ in module._package_stamp()]
     for called in (ground_contact, walk_step):
         assert str(Path(called.__file__).relative_to(Path(module.__file__).parent)) in names
+
+
+def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
+    """Catches a Ctrl-C that comes where C code has called Python, which drops its exception: a motion would go on."""
+    times = 0
+
+    def interrupt(frame: Any, event: str, _: Any) -> None:
+        nonlocal times
+        if event == "call" and frame.f_code.co_name == "_raw_object_cache_notify":
+            times += 1
+            signal.raise_signal(signal.SIGINT)
+
+    @compiled
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    sys.setprofile(interrupt)
+    threading.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            twice(1.0)
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+    assert times == 1
+    assert twice(1.0) == 2.0
 
 
 def test_division_by_zero_is_as_in_numpy() -> None:
