@@ -23,14 +23,17 @@ class AttitudeSensor(Model):
 
 def quantise(angle: Array, counts_per_turn: int | None) -> Array:
     """Angle of an encoder with whole counts [rad]; None leaves the angle as it is."""
-    if counts_per_turn is None:
-        return angle
-    return in_whole_counts(angle, 2.0 * np.pi / counts_per_turn)
+    return in_whole_counts(angle, angle_of_count(counts_per_turn))
+
+
+def angle_of_count(counts_per_turn: int | None) -> float:
+    """One count of an encoder [rad]; 0 for one without counts."""
+    return 0.0 if counts_per_turn is None else 2.0 * np.pi / counts_per_turn
 
 
 def in_whole_counts(angle: Array, count_rad: float) -> Array:
-    """The nearest whole counts of an encoder, as an angle [rad]."""
-    return np.rint(angle / count_rad) * count_rad
+    """The nearest whole counts of an encoder, as an angle [rad]; counts of 0 leave it as it is."""
+    return np.rint(angle / count_rad) * count_rad if count_rad > 0.0 else angle
 
 
 def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Array) -> Array:

@@ -15,7 +15,7 @@ from elastic_env.rows import Rows
 from elastic_env.signals import Array, BoolArray, Signals
 from elastic_env.simulation import Simulation, simulate
 from elastic_env.step_info import StepInfo
-from elastic_env.tasks.task import Task
+from elastic_env.tasks.task import DIVERGED_ROW, TERMINATED_ROW, TRUNCATED_ROW, Task
 
 DIVERGED = "diverged"
 """Reason of termination where the simulation produced a bad number; MuJoCo alone would restart it silently."""
@@ -50,7 +50,7 @@ class _Sample(Rows):
 
 
 class Worlds:
-    """Runs a task in many worlds: checks actions, advances physics, adds up rewards and metrics, finds the ends.
+    """Runs a task in many worlds: checks actions, advances physics, adds up metrics, says why episodes end.
 
     Args:
         task: The rules.
@@ -69,7 +69,9 @@ class Worlds:
         self._shape = (task.num_worlds, len(self._bound))
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
         self._samples: list[tuple[Any, ...]] = []  # of `_Sample`s to be
-        self._scored_at_once = min(max(_SCORED_ROWS // task.num_worlds, _FEWEST_STEPS), _MOST_STEPS)
+        at_once = min(max(_SCORED_ROWS // task.num_worlds, _FEWEST_STEPS), _MOST_STEPS)
+        # many take 2 ms, half a control period of hardware
+        self._scored_at_once = at_once if simulation is None else _FEWEST_STEPS
         self._failures = (DIVERGED, *task.failure_names)
         self._no_reason = np.full(task.num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
@@ -102,9 +104,9 @@ class Worlds:
         self.task.disturb(self.simulation)
         self.simulation.advance(self.task.num_substeps)
         observation, of_task, reward, ends, is_over = self.task.sense(self.simulation, self.simulation.diverged())
-        sample = of_task, is_clipped, ends[0]
+        sample = of_task, is_clipped, ends[DIVERGED_ROW]
         self._samples.append(sample)
-        terminated, truncated = ends[-2], ends[-1]
+        terminated, truncated = ends[TERMINATED_ROW], ends[TRUNCATED_ROW]
         reason = self._reasons(ends) if is_over else self._no_reason
         info = StepInfo({"termination": reason}, partial(self._rest, sample))
         if is_over:
@@ -144,7 +146,7 @@ class Worlds:
             raise self._refused(given)
         offset, is_clipped = given.astype(np.float64, order="C"), np.empty(len(given), dtype=np.bool_)
         if not _clip(offset, self._bound, is_clipped):
-            raise self._refused(given)
+            raise self._refused(given.astype(np.float64))
         return offset, is_clipped
 
     def _reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:

@@ -2,7 +2,9 @@
 
 import copy
 import importlib.util
+import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -10,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numba
 import numpy as np
 import pytest
+from numba.core import caching
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env import compiled as module
 from elastic_env.compiled import compiled
-from elastic_env.tasks import walk_step
+from elastic_env.tasks import walk_state, walk_step
 from elastic_env.walking import ground_contact
 
 TWICE = """
@@ -39,26 +43,95 @@ def loaded(path: Path) -> Any:
     return found.twice
 
 
+def hits(twice: Any) -> int:
+    """How much of what a function did was found compiled."""
+    assert twice(np.ones(2)).tolist() == [2.0, 2.0]
+    assert twice(1.0) == 2.0
+    return sum(twice.stats.cache_hits.values())
+
+
 def test_what_was_compiled_is_kept_until_any_module_of_the_package_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a cache that knows a function's own file alone, and keeps old constants and callees."""
+    """Catches a cache that knows a function's own file alone, and keeps old constants and callees, or old files."""
     path = tmp_path / "module_of_twice.py"
     path.write_text(TWICE)
-    hits = []
-    for stamp in (("a", 1, 1), ("a", 1, 1), ("a", 2, 1), ("a", 2, 1)):
-        monkeypatch.setattr(module, "_package_stamp", lambda stamp=stamp: (stamp,))
-        twice = loaded(path)
-        assert twice(np.ones(2)).tolist() == [2.0, 2.0]
-        hits.append(sum(twice.stats.cache_hits.values()))
-    assert hits == [0, 1, 0, 1]
+    found = []
+    for stamp in ("a", "a", "b", "b"):
+        monkeypatch.setattr(module, "_package_stamp", lambda stamp=stamp: stamp)
+        found.append(hits(loaded(path)))
+        assert len(list(tmp_path.rglob("*.nbc"))) == 2
+    assert found == [0, 2, 0, 2]
 
 
-def test_the_stamp_of_the_package_changes_with_a_module_that_is_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a stamp without the modules of sub-packages."""
-    names = [name for name, _, _ in module._package_stamp()]
-    for called in (ground_contact, walk_step):
-        assert str(Path(called.__file__).relative_to(Path(module.__file__).parent)) in names
+def test_what_was_not_kept_whole_is_compiled_again(tmp_path: Path) -> None:
+    """Catches a crash while writing that breaks every program from then on, and one type's code for another."""
+    path = tmp_path / "module_of_twice.py"
+    path.write_text(TWICE)
+    assert hits(loaded(path)) == 0
+    one, other = sorted(tmp_path.rglob("*.nbc"))
+    whole = one.read_bytes()
+    for damaged in (b"", whole[:100], other.read_bytes()):
+        one.write_bytes(damaged)
+        assert hits(loaded(path)) == 1
+        assert one.read_bytes() != damaged
+
+
+@pytest.mark.parametrize("is_found_late", [False, True])
+def test_where_nothing_can_be_kept_it_works_all_the_same(
+    is_found_late: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an environment that cannot be imported from a read-only disk, or that fails when the disk is full."""
+
+    def refuse(*_: Any) -> None:
+        raise OSError("read-only file system")
+
+    path = tmp_path / "module_of_twice.py"
+    path.write_text(TWICE)
+    twice = loaded(path) if is_found_late else None
+    monkeypatch.setattr(caching._CacheLocator, "ensure_cache_path", refuse)
+    assert hits(twice or loaded(path)) == 0
+    assert not list(tmp_path.rglob("*.nbc"))
+
+
+def test_the_stamp_of_the_package_changes_with_every_module(tmp_path: Path) -> None:
+    """Catches a stamp without the modules of sub-packages, or one that looks at their size or time alone."""
+    called = tmp_path / "tasks" / "called.py"
+    called.parent.mkdir()
+    stamps = set()
+    for text in ("A = 1", "A = 2", "A = 12"):
+        called.write_text(text)
+        os.utime(called, (0, 0))
+        stamps.add(module._stamp_of(tmp_path))
+    assert len(stamps) == 3
+    called.write_text("A = 1")
+    assert module._stamp_of(tmp_path) in stamps
+
+
+def test_without_the_compiler_it_works_all_the_same() -> None:
+    """Catches an import that fails when Numba is switched off, as for a debugger."""
+    code = (
+        "import gymnasium, elastic_env; env = gymnasium.make('elastic_env/WalkInPlace-v0'); env.reset(seed=0);"
+        "print([float(x).hex() for x in env.step(env.action_space.sample() * 0)[0]])"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, check=True, capture_output=True
+    )  # fmt: skip
+    assert said.stdout.count(b"0x") == 95
+
+
+def test_a_function_of_the_users_can_call_one_of_ours() -> None:
+    """Catches a thread that waits for the compiler's lock, which the function that is compiled holds."""
+
+    @compiled
+    def twice(value: float) -> float:
+        return 2.0 * value
+
+    @numba.njit
+    def four_times(value: float) -> float:
+        return twice(twice(value))
+
+    assert four_times(1.5) == 6.0
 
 
 def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
@@ -113,7 +186,12 @@ def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, m
         given, outcome = list(arguments[:-4]), arguments[-4:]
         interpreted, plain = copy.deepcopy(given), copy.deepcopy(outcome)
         is_over = ran(*arguments)
-        assert ran.py_func(*interpreted, *plain) == is_over  # type: ignore[attr-defined]
+        with pytest.MonkeyPatch.context() as uncompiled:
+            for owner in (walk_step, walk_state, ground_contact):
+                for name, function in vars(owner).items():
+                    if hasattr(function, "py_func"):
+                        uncompiled.setattr(owner, name, function.py_func)
+            assert ran.py_func(*interpreted, *plain) == is_over  # type: ignore[attr-defined]
         for mine, expected in zip(outcome, plain, strict=True):
             np.testing.assert_allclose(mine, expected, rtol=1e-13, atol=1e-13)
         np.testing.assert_array_equal(given[5], interpreted[5])  # samples of noise that are used

@@ -401,7 +401,9 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "compiled")},
     ) as program:  # fmt: skip
         log = tmp_path / "run" / "log.csv"
-        while program.poll() is None and not (log.exists() and log.read_text().count("\n") > 500):
+        deadline = time.monotonic() + 120.0
+        while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") > 500):
+            assert program.poll() is None
             time.sleep(0.05)  # what is kept is seen on the disk while the run goes on
         program.send_signal(number)
         said, complained = program.communicate(timeout=30)

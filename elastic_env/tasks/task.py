@@ -1,4 +1,4 @@
-"""What a task is: the rules of one environment on (num_worlds, ...) arrays, without any loop over worlds."""
+"""What a task is: the rules of one environment on (num_worlds, ...) arrays."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
@@ -11,6 +11,9 @@ from elastic_env.robots.robot_model import RobotModel
 from elastic_env.signals import Array, BoolArray, Signals, SignalTable
 from elastic_env.simulation import Simulation
 
+DIVERGED_ROW, TERMINATED_ROW, TRUNCATED_ROW = 0, -2, -1
+"""Rows of `Outcome.ends`; behind the first stands one for each of `Task.failure_names`."""
+
 
 class Outcome(NamedTuple):
     """What a control step came to, one column or row per world.
@@ -19,7 +22,7 @@ class Outcome(NamedTuple):
         observation: (num_worlds, len(observation_table)).
         sample: What signals and masks need of this step, `elastic_env.rows.Rows` that nothing changes later.
         reward: (num_worlds,).
-        ends: Whether the world diverged, failed by each of `Task.failure_names`, and is terminated and truncated.
+        ends: Whether the world diverged, failed, is terminated and is truncated, see `DIVERGED_ROW`.
         is_over: Whether any world is.
     """
 

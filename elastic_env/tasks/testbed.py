@@ -33,6 +33,7 @@ Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], wi
 | `episode_metrics` | | at the end of the episode: its figures, whose names end with their unit |
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -221,8 +222,7 @@ class TestbedTask:
         self._shown = before if self.config.scenario.delay_steps else self._measured
         sample = self.sample()
         ends = np.array([diverged, diverged, (self._step >= self.num_steps) & ~diverged])
-        terms = self.reward_terms(sample)
-        reward = terms["link_error"] + terms["command_rate"] + terms["divergence"]
+        reward = functools.reduce(np.add, self.reward_terms(sample).values())
         return Outcome(self.observe(), sample, reward, ends, bool(ends.any()))
 
     def observe(self) -> Array:

@@ -65,7 +65,7 @@ from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
 from elastic_env.scenario import Scenario
-from elastic_env.sensors import NoiseStream, is_due
+from elastic_env.sensors import NoiseStream, angle_of_count, is_due
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.simulation import Simulation, substeps
 from elastic_env.tasks import walk_step
@@ -128,7 +128,6 @@ class WalkTask:
         require_feasible(self.plan, robot, model.servos)
         self._true_model = _true_model(config, self.plan)
         self.model = config.true_model()
-        self._robot = robot
         at = JointAddresses.of(self.model, LEG_JOINTS)
         # motor sides, link sides, the pelvis
         positions = np.concatenate([at.theta, at.q, np.arange(7)])
@@ -162,8 +161,7 @@ class WalkTask:
         self._noise_spread = _noise_spread(config.scenario)
         self._noise = NoiseStream(n, width=len(self._noise_spread))
         counted = self._true_model.encoder_counts_per_turn if config.scenario.encoder_counts else None
-        count_rad = 0.0 if counted is None else 2.0 * np.pi / counted
-        self._sensors = count_rad, imu.noise_rad, imu.bias_rad, imu.sine_error_rad
+        self._sensors = angle_of_count(counted), imu.noise_rad, imu.bias_rad, imu.sine_error_rad
         self._record = self._shown = np.zeros((n, RECORD_END))
         self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
         for table in (
@@ -217,7 +215,7 @@ class WalkTask:
             simulation.views(_PHYSICS), self._addresses, self._feet, self._rows, *self._measuring(), self._limits,
             self._weights, self._offset, diverged, last, is_delayed, record, observation, reward, ends,
         )  # fmt: skip
-        self._record, self._shown, self._has_fallen = record, last if is_delayed else record, ends[walk_step.FELL]
+        self._record, self._shown, self._has_fallen = record, last if is_delayed else record, ends[walk_step.FELL_ROW]
         return Outcome(observation, WalkRecord(record), reward, ends, is_over)
 
     def observe(self) -> Array:
@@ -342,8 +340,10 @@ def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Array:
     imu_is_due = is_due(steps, config.scenario.pelvis_imu.rate_hz, config.control_period_s)
     weight = np.where(timing.walking, 1.0, config.reward.standing)
     marks = [_halves_of_swing(plan), RIGHT - timing.support, imu_is_due, weight]
-    rows = [plan.q, plan.q_dot, plan.q_ddot, *clock, plan.zmp, *marks]
-    return np.column_stack([np.asarray(row, dtype=np.float64) for row in rows])
+    columns = [plan.q, plan.q_dot, plan.q_ddot, *clock, plan.zmp, *marks]
+    rows = np.column_stack([np.asarray(column, dtype=np.float64) for column in columns])
+    assert rows.shape[1] == walk_step.PLAN_END  # compiled code does not look
+    return rows
 
 
 def _phase_rows(plan: WalkPlan) -> BoolArray:

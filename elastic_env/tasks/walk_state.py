@@ -19,7 +19,14 @@ def _begins(*widths: int) -> list[int]:
     return [sum(widths[:i]) for i in range(len(widths) + 1)]
 
 
-# columns where groups begin, as single numbers: compiled code takes them for constants
+# Columns where groups begin, as single numbers: compiled code takes them for constants. What is not said here is said
+# by the properties of `WalkRecord`.
+#   state        THETA to Q_DOT, PELVIS [m], QUATERNION, PELVIS_RATE (in its frame, [rad/s]), ATTITUDE, ANKLES,
+#                WRENCH (of both feet on the legs, in the frames of the feet, [N], [N·m]), FORCE, ZMP, SERVO_TORQUE
+#   of the step  STIFFNESS, OFFSET (commanded, [rad]), COMMAND (q_ref + offset, [rad]), COMMAND_RATE, STEP,
+#                CONTACT_SINCE
+#   measured     ENCODER, ENCODER_BEFORE (one step) [rad], IMU_ATTITUDE (roll, pitch, [rad]), GYRO (as PELVIS_RATE),
+#                SENSORS (as WRENCH)
 THETA, Q, PELVIS, QUATERNION, POSITION_END = _begins(JOINTS, JOINTS, 3, 4)
 THETA_DOT, Q_DOT, PELVIS_RATE, VELOCITY_END = (POSITION_END + i for i in _begins(JOINTS, JOINTS, 3))
 ATTITUDE, ANKLES, WRENCH, FORCE, ZMP, SERVO_TORQUE, STATE_END = (
@@ -158,9 +165,15 @@ def highest(values: Array) -> Array:
     return values.T.copy().max(axis=0)
 
 
+@compiled
 def rms(values: Array) -> Array:
-    """Root of the mean square over the last axis."""
-    return np.sqrt(np.vecdot(values, values) / values.shape[-1])
+    """Root of the mean square over the last axis of (n, m)."""
+    found = np.zeros(len(values))
+    for row in range(len(values)):
+        for value in values[row]:
+            found[row] += value * value
+        found[row] = math.sqrt(found[row] / values.shape[1])
+    return found
 
 
 def rotation_of(quaternion: Array) -> Array:

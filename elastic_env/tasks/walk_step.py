@@ -12,6 +12,7 @@ import numpy as np
 from elastic_env.compiled import compiled
 from elastic_env.sensors import in_whole_counts, shown_angle
 from elastic_env.signals import Array, BoolArray, IntArray, Parameter
+from elastic_env.tasks.task import DIVERGED_ROW, TERMINATED_ROW, TRUNCATED_ROW
 from elastic_env.tasks.walk_state import (
     ANKLES,
     ATTITUDE,
@@ -40,6 +41,7 @@ from elastic_env.tasks.walk_state import (
     WRENCH,
     ZMP,
     attitude_of,
+    rms,
 )
 from elastic_env.walking.ground_contact import ground_wrench, moment_point
 
@@ -48,8 +50,8 @@ HALF, SWING_FOOT, IMU_IS_DUE, WEIGHT, PLAN_END = range(REFERENCE_END, REFERENCE_
 """Columns of the plan: what is observed; half and foot of a swing, whether the IMU is due, weight in the reward."""
 FIRST_HALF, SECOND_HALF = 1, 2
 """Of a swing; 0 is none."""
-DIVERGED, FELL, TERMINATED, TRUNCATED, NUM_ENDS = range(5)
-"""Rows of what ends an episode."""
+FELL_ROW, NUM_ENDS = 1, 4
+"""Of what ends an episode, beside `elastic_env.tasks.task.DIVERGED_ROW` and those after it."""
 _TILT = ATTITUDE + 2
 _NUM_BODY = SCORES - IMU_ATTITUDE
 _REFERENCE = 2 * JOINTS + _NUM_BODY
@@ -113,11 +115,11 @@ def read(
 
 @compiled
 def measure(
-    samples: Array, used: Any, spread: Array, bias: Array, numbers: Any, worlds: BoolArray, due: BoolArray, last: Array,
+    samples: Array, used: Any, spread: Array, bias: Array, sensors: Any, worlds: BoolArray, due: BoolArray, last: Array,
     record: Array,
 ) -> None:  # fmt: skip
     """What the sensors of some worlds show; the others keep their last values, as an IMU does that is not due."""
-    count_rad, noise_rad, bias_rad, sine_error_rad = numbers
+    count_rad, noise_rad, bias_rad, sine_error_rad = sensors
     for world in range(len(record)):
         row, before = record[world], last[world]
         if not worlds[world]:
@@ -126,8 +128,7 @@ def measure(
         noise = samples[min(used[world], len(samples) - 1), world]
         used[world] += 1
         for i in range(JOINTS):
-            angle = row[THETA + i] + bias[world, i]
-            row[ENCODER + i] = _in_whole_counts(angle, count_rad) if count_rad > 0.0 else angle
+            row[ENCODER + i] = _in_whole_counts(row[THETA + i] + bias[world, i], count_rad)
             row[ENCODER_BEFORE + i] = before[ENCODER + i]
         row[IMU_ATTITUDE:SENSORS] = before[IMU_ATTITUDE:SENSORS]
         if due[world]:
@@ -156,14 +157,6 @@ def observe(record: Array, shown: Array, plan: Array, period_s: float, observati
             row[_REFERENCE + i] = coming[i]
         for i in range(JOINTS):
             row[_REFERENCE + REFERENCE_END + i] = record[world, COMMAND + i]
-
-
-@compiled
-def _rms(values: Array) -> float:
-    total = 0.0
-    for value in values:
-        total += value * value
-    return math.sqrt(total / len(values))
 
 
 @compiled
@@ -203,7 +196,7 @@ def control_step(
         record: To be filled.
         observation: To be filled.
         reward: To be filled, (n,).
-        ends: To be filled: what ends, by `DIVERGED` to `TRUNCATED`, (4, n).
+        ends: To be filled: what ends, `elastic_env.tasks.task.Outcome.ends`, (4, n).
 
     Returns:
         Whether anything ends.
@@ -212,6 +205,7 @@ def control_step(
     n, num_steps = len(last), len(plan) - 1
     healthy, due = ~diverged, np.empty(n, dtype=np.bool_)
     read(physics, addresses, feet, least_n, healthy, last, record)
+    effort, change = rms(record[:, SERVO_TORQUE:STATE_END]), rms(offset - last[:, OFFSET:COMMAND])
     is_over = False
     for world in range(n):
         row, before = record[world], last[world]
@@ -221,20 +215,21 @@ def control_step(
         for i in range(JOINTS):
             row[OFFSET + i] = offset[world, i]
             row[COMMAND + i] = now[i] + offset[world, i]
-        row[COMMAND_RATE] = _rms(row[OFFSET:COMMAND] - before[OFFSET:COMMAND]) / period_s
+        row[COMMAND_RATE] = change[world] / period_s
         _watch_swing_foot(row, now[HALF], int(now[SWING_FOOT]), loaded_n)
         due[world] = now[IMU_IS_DUE] > 0.0
         fell = row[PELVIS + 2] < lowest_m or row[_TILT] > highest_rad
-        ends[DIVERGED, world], ends[FELL, world] = diverged[world], fell
-        ends[TERMINATED, world] = diverged[world] or fell
-        ends[TRUNCATED, world] = not ends[TERMINATED, world] and row[STEP] >= num_steps
-        is_over = is_over or ends[TERMINATED, world] or ends[TRUNCATED, world]
+        is_terminated = diverged[world] or fell
+        is_truncated = not is_terminated and row[STEP] >= num_steps
+        ends[DIVERGED_ROW, world], ends[FELL_ROW, world] = diverged[world], fell
+        ends[TERMINATED_ROW, world], ends[TRUNCATED_ROW, world] = is_terminated, is_truncated
+        is_over = is_over or is_terminated or is_truncated
         deviation = math.hypot(row[ZMP] - now[ZMP_REFERENCE], row[ZMP + 1] - now[ZMP_REFERENCE + 1])
         row[SCORES] = weights[0] * now[WEIGHT] * _tilt_penalty(row[_TILT])
         row[SCORES + 1] = weights[1] * now[WEIGHT] * _zmp_penalty(deviation)
-        row[SCORES + 2] = -weights[2] * _rms(row[SERVO_TORQUE:STATE_END])
+        row[SCORES + 2] = -weights[2] * effort[world]
         row[SCORES + 3] = -weights[3] * row[COMMAND_RATE]
-        row[SCORES + 4] = -weights[4] if ends[TERMINATED, world] else 0.0
+        row[SCORES + 4] = -weights[4] if is_terminated else 0.0
         reward[world] = row[SCORES] + row[SCORES + 1] + row[SCORES + 2] + row[SCORES + 3] + row[SCORES + 4]
     measure(samples, used, spread, bias, sensors, healthy, due, last, record)
     observe(record, last if is_delayed else record, plan, period_s, observation)

@@ -40,7 +40,7 @@ class FootSensors:
         Returns:
             (n, L, 3) each [N], [N·m].
         """
-        seen, R = _rows(sensors, 3), _rows(foot_R, 3)
+        seen, R = _rows(np.broadcast_to(sensors, (*foot_R.shape[:-2], 2, 3)), 3), _rows(foot_R, 3)
         force, moment = np.empty(R.shape[:-1]), np.empty(R.shape[:-1])
         _ground_wrenches(seen, R, self.com, self.weight, force, moment)
         shape = foot_R.shape[:-1]
