@@ -88,7 +88,7 @@ class _Files:
         """What was saved under a key; None if nothing was, or nothing whole."""
         try:
             saved_key, data = pickle.loads(self._path(key).read_bytes())
-        except (OSError, EOFError, pickle.UnpicklingError):
+        except Exception:
             return None
         return data if saved_key == key else None
 

@@ -102,14 +102,14 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
     return number
 
 
-def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, console: Console) -> bool:
+def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, imu_baudrate: int, console: Console) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
     HardwareSettings(port=port, imu_port=imu_port)  # which refuses one port for both
     require_ids(ids)
     with Bus(port, baudrate) as bus:
         checks = check_bus(bus, ids)
     if imu_port is not None:
-        with AttitudeStream(imu_port) as stream:
+        with AttitudeStream(imu_port, imu_baudrate) as stream:
             sample = stream.latest()
         angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in ("roll", "pitch", "yaw"))
         checks.append(Check("IMU", f"{angles} rad"))

@@ -78,7 +78,7 @@ def _round_trips(bus: Bus, servo_id: int) -> list[Check]:
     trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(times):.2f} ms"
     return [
         Check("round trip of a ping", trip, "" if typical < _SLOW_S else slow),
-        Check("lost replies", f"{lost} to {_PINGS} pings", "" if lost < _LOST else bad, is_vital=False),
+        Check("lost replies", f"{lost} of {_PINGS} pings", "" if lost < _LOST else bad, is_vital=False),
     ]
 
 
@@ -106,7 +106,7 @@ def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
         Check("operating mode", str(mode), unless(mode == _POSITION_MODE, f"{write} 3, position, to operating_mode")),
         Check("return delay", f"{1e6 * delay_s:.0f} µs",
               unless(delay_s <= _LARGEST_DELAY_S, f"{write} 0 to return_delay_time")),
-        Check("replies", str(get("status_return_level")),
+        Check("status return level", str(get("status_return_level")),
               unless(get("status_return_level") == _FULL_REPLIES, "write 2 to status_return_level")),
         Check("current limit", f"{limit_a:.1f} A",
               unless(limit_a <= needed_a + 0.1, f"{write} {round(needed_a / model.current_unit)} to "

@@ -197,9 +197,9 @@ class ServoPlant:
             return
         limits = self.settings.limits
         question = (
-            f"The servo at {self.settings.port} will move to {angle:.3f} rad, then between {limits.lowest_rad:g} and "
-            f"{limits.highest_rad:g} rad, with a pendulum of {self._pendulum_nm:.1f} N·m. Is its way free, and the "
-            "power switch in reach? Type yes: "
+            f"The servo at {self.settings.port} will move to {angle:.3f} rad, then anywhere between its limits, "
+            f"{limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of {self._pendulum_nm:.1f} N·m. Is "
+            "its way free, and the power switch in reach? Type the whole word yes: "
         )
         if not sys.stdin.isatty():
             raise HardwareError(

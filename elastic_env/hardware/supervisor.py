@@ -94,7 +94,8 @@ class Supervisor:
         try:
             return actions[request["do"]](**request["with"])
         except HardwareError as error:
-            said = error if self._guard is None else self._stop(str(error))  # torque is still on
+            is_gone = isinstance(error, BusGoneError)
+            said = error if self._guard is None else self._stop(str(error), is_gone)  # torque is still on
             return {"error": type(said).__name__, "message": str(said)}
 
     def _attach(self, ids: list[list[int]]) -> dict[str, Any]:
@@ -192,12 +193,13 @@ class Supervisor:
                     said.append(str(error))
         return f" ({'; '.join(said)})"
 
-    def _stop(self, reason: str) -> HardwareError:
-        """End the motion for a reason: the error that answers every request for motion from now on."""
+    def _stop(self, reason: str, is_gone: bool = False) -> HardwareError:
+        """End the motion for a reason, which may be that a bus is gone: the error that answers from now on."""
         problem = self._let_go()
         said = "torque is off" if problem is None else str(problem)
         kind = BusGoneError if isinstance(problem, BusGoneError) else FaultError
-        self._fault = kind(said if reason in said else f"{reason}; {said}")
+        is_said = reason in said or (is_gone and kind is BusGoneError)  # by torque off, which met the same
+        self._fault = kind(said if is_said else f"{reason}; {said}")
         return self._fault
 
     def _let_go(self) -> HardwareError | None:

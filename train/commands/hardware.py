@@ -46,12 +46,14 @@ class Check:
     """Bits per second."""
     imu_port: str | None = None
     """Port of the IMU, another one than the servos'."""
+    imu_baudrate: int = 115_200
+    """Bits per second of the IMU's port; an IMU on USB has none."""
 
     def run(self) -> None:
         """Check."""
         from train.hardware import check
 
-        if not check(self.port, self.ids, self.baudrate, self.imu_port, CONSOLE):
+        if not check(self.port, self.ids, self.baudrate, self.imu_port, self.imu_baudrate, CONSOLE):
             sys.exit(1)
 
 
@@ -93,6 +95,8 @@ class Emulate:
     """Ids of the servos; the IMU is on the link of the first."""
     model_number: int = 54024
     """Type of the servos: 54024, 54025 or 2020."""
+    baudrate: int = 3_000_000
+    """Bits per second; no other rate is heard."""
     scenario: str = "nominal"
     """Scenario of the joint and of the IMU, as in elastic identify."""
     stiffness: float | None = None
@@ -124,7 +128,7 @@ class Emulate:
             latency_s=1e-3 * self.latency_ms,
         )  # fmt: skip
         config = EmulatorConfig(
-            ids=tuple(self.ids), model_number=self.model_number, faults=faults, seed=self.seed,
+            ids=tuple(self.ids), model_number=self.model_number, baudrate=self.baudrate, faults=faults, seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
         )  # fmt: skip
         emulate(config, CONSOLE)

@@ -32,6 +32,8 @@ class EmulatorConfig(Model):
     def _servos_exist(self) -> Self:
         servo_model(self.model_number)
         if not hasattr(termios, f"B{self.baudrate}"):
-            raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has 57600, 1000000, 3000000")
+            raise ValueError(
+                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has 57600, 1000000, 3000000 and 4000000"
+            )
         require_ids(self.ids)
         return self
