@@ -88,7 +88,7 @@ class _Files:
         """What was saved under a key; None if nothing was, or nothing whole."""
         try:
             saved_key, data = pickle.loads(self._path(key).read_bytes())
-        except Exception:
+        except Exception:  # what is damaged can raise anything, and is compiled again
             return None
         return data if saved_key == key else None
 
