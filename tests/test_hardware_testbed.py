@@ -406,6 +406,8 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
             assert program.poll() is None
             time.sleep(0.05)  # what is kept is seen on the disk while the run goes on
         program.send_signal(number)
+        time.sleep(0.01)
+        program.send_signal(number)  # a nervous user's second one takes nothing from what is said
         said, complained = program.communicate(timeout=30)
     rows = list(csv.DictReader(log.read_text().splitlines()))
     assert len(rows) >= 500, complained

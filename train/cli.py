@@ -1,10 +1,12 @@
 """The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, hardware, demo."""
 
 import contextlib
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -42,23 +44,32 @@ class _EndedError(KeyboardInterrupt):
     """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
 
 
-def _end(number: int, _: Any) -> None:
-    signal.signal(number, signal.SIG_IGN)  # a second one does not interrupt what the first one asked for
-    raise _EndedError(number)
+_SAME_WISH_S = 2.0
+"""How long a further signal does not interrupt what the first one asked for."""
 
 
 @contextlib.contextmanager
 def _ended_by(*numbers: int) -> Iterator[None]:
-    """Signals that would end this program without a word end what is within by an exception; ignored ones do not."""
+    """Signals that would end this program end what is within by an exception; ignored ones do not."""
+    asked_s = -math.inf
+
+    def end(number: int, _: Any) -> None:
+        nonlocal asked_s
+        now = time.monotonic()
+        if now - asked_s > _SAME_WISH_S:
+            asked_s = now
+            raise _EndedError(number)
+
     is_main = threading.current_thread() is threading.main_thread()
-    taken = [number for number in numbers if is_main and signal.getsignal(number) == signal.SIG_DFL]
+    before = {number: signal.getsignal(number) for number in numbers if is_main}
+    taken = {n: handler for n, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)}
     for number in taken:
-        signal.signal(number, _end)
+        signal.signal(number, end)
     try:
         yield
     finally:
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in taken.items():
+            signal.signal(number, handler)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -70,14 +81,15 @@ def main(arguments: list[str] | None = None) -> None:
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
     )  # fmt: skip
-    try:
-        with _ended_by(signal.SIGTERM, signal.SIGHUP):
+    with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        try:
             command.run()
-    except ElasticError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {escape(_with_notes(error))}", highlight=False, soft_wrap=True)
-        sys.exit(2)
-    except KeyboardInterrupt as error:
-        number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
-        said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-        Console(stderr=True).print(_with_notes(error, said), highlight=False, markup=False, soft_wrap=True)
-        os._exit(128 + number)  # worker processes must not keep the terminal waiting
+        except ElasticError as error:
+            said = f"[bold red]error:[/] {escape(_with_notes(error))}"
+            Console(stderr=True).print(said, highlight=False, soft_wrap=True)
+            sys.exit(2)
+        except KeyboardInterrupt as error:
+            number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
+            said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+            Console(stderr=True).print(_with_notes(error, said), highlight=False, markup=False, soft_wrap=True)
+            os._exit(128 + number)  # worker processes must not keep the terminal waiting
