@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numba
 import numpy as np
 import pytest
 from numba.core import caching
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env import compiled as module
+from elastic_env import metrics, worlds
 from elastic_env.compiled import compiled
 from elastic_env.tasks import walk_state, walk_step
 from elastic_env.walking import ground_contact
@@ -121,18 +121,27 @@ def test_without_the_compiler_it_works_all_the_same() -> None:
     assert said.stdout.count(b"0x") == 95
 
 
-def test_a_function_of_the_users_can_call_one_of_ours() -> None:
+USERS = """
+import numba
+from elastic_env.compiled import compiled
+
+@compiled
+def twice(value):
+    return 2.0 * value
+
+@numba.njit
+def four_times(value):
+    return twice(twice(value))
+
+assert four_times(1.5) == 6.0
+"""
+
+
+def test_a_function_of_the_users_can_call_one_of_ours(tmp_path: Path) -> None:
     """Catches a thread that waits for the compiler's lock, which the function that is compiled holds."""
-
-    @compiled
-    def twice(value: float) -> float:
-        return 2.0 * value
-
-    @numba.njit
-    def four_times(value: float) -> float:
-        return twice(twice(value))
-
-    assert four_times(1.5) == 6.0
+    path = tmp_path / "users.py"
+    path.write_text(USERS)
+    subprocess.run([sys.executable, str(path)], check=True, timeout=60)
 
 
 def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
@@ -160,6 +169,20 @@ def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
         threading.setprofile(None)
     assert times == 1
     assert twice(1.0) == 2.0
+
+
+def test_a_testbed_compiles_nothing_once_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a first step, or first steps that are scored, which let a servo wait for the compiler."""
+    used: list[Any] = []
+    for owner, name in ((worlds, "_clip"), (metrics, "_add_in_order")):
+        used.append(compiled(getattr(owner, name).py_func))
+        monkeypatch.setattr(owner, name, used[-1])
+    env = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True)
+    assert [len(function.signatures) for function in used] == [1, 1]
+    env.reset(seed=0)
+    for k in range(300):
+        env.step(np.zeros(1, dtype=(np.float32, np.float64)[k % 2]))
+    assert [len(function.signatures) for function in used] == [1, 1]
 
 
 def test_division_by_zero_is_as_in_numpy() -> None:

@@ -387,8 +387,7 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
 ) -> None:
     """Catches a log that is written at the end only, and an end after which nobody knows what the servo does.
 
-    And a motion that waits for the compiler, whose last results are not there: in the first step, or where 256 steps
-    are scored at once.
+    And a motion that waits for the compiler, of which nothing is kept, where steps are scored.
     """
     mounting = tmp_path / "mounting.yaml"
     mounting.write_text("approach_rad_s: 2.0\nlimits: {patience_cycles: 10, hang_s: 0.09}\n")

@@ -22,7 +22,7 @@ from elastic_env.hardware.checks import Check, check_bus
 from elastic_env.hardware.control_table import servo_models
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
-from elastic_env.hardware.protocol import require_ids
+from elastic_env.hardware.protocol import RATES, require_ids
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed import Pendulum
 from train.conditions import PolicySpec
@@ -30,7 +30,6 @@ from train.environments import environment
 from train.evaluate import make_policy
 from train.runs import run_folder
 
-_SCAN_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 _SHOWN_S = 1.0
 _PATIENT_IMU_S = 0.2
 PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
@@ -85,7 +84,7 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
     """
     table = Table("bit/s", "id", "model number", "model", "firmware", title=f"servos at {port}")
     number = 0
-    for rate in _SCAN_RATES if baudrate is None else (baudrate,):
+    for rate in RATES if baudrate is None else (baudrate,):
         with Bus(port, rate) as bus:
             for found in bus.scan():
                 model = servo_models().get(found.model_number)

@@ -78,9 +78,7 @@ class Port(PortHandler):
         """
         name = self.port_name
         if self.getCFlagBaud(self.baudrate) < 0:
-            raise PortError(
-                f"the SDK has no rate of {self.baudrate} bit/s for {name}; try 57600, 1000000, 3000000 or 4000000"
-            )
+            raise PortError(f"the SDK has no rate of {self.baudrate} bit/s for {name}; try one of {protocol.RATES}")
         self._lock = lock_port(name)
         try:
             self.setupPort(self.baudrate)

@@ -37,6 +37,8 @@ STATUS_ERRORS = {
 """What the number in a status means."""
 
 _POLYNOMIAL = 0x8005
+RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
+"""Rates that servos, SDK and pseudo-terminals share, the likeliest first [bit/s]."""
 _LONGEST = 1024
 _STUFFED = b"\xff\xff\xfd"
 

@@ -8,7 +8,7 @@ from pydantic import model_validator
 from elastic_env.config import Model, quantity
 from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.protocol import require_ids
+from elastic_env.hardware.protocol import RATES, require_ids
 from elastic_env.tasks.testbed_config import TestbedConfig
 
 
@@ -32,8 +32,6 @@ class EmulatorConfig(Model):
     def _servos_exist(self) -> Self:
         servo_model(self.model_number)
         if not hasattr(termios, f"B{self.baudrate}"):
-            raise ValueError(
-                f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has 57600, 1000000, 3000000 and 4000000"
-            )
+            raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}")
         require_ids(self.ids)
         return self
