@@ -2,10 +2,23 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import ClassVar
 
 
 class ElasticError(ValueError):
-    """Base of every error that a wrong input can cause in this project."""
+    """Base of every error that this project raises on purpose.
+
+    Attributes:
+        exit_code: What the command `elastic` ends with: 2 for a wrong input, 3 where the system failed.
+    """
+
+    exit_code: ClassVar[int] = 2
+
+
+class SystemFailedError(ElasticError):
+    """The input was right and the system failed: a full disk, a killed process, a lost port."""
+
+    exit_code = 3
 
 
 class ConfigurationError(ElasticError):

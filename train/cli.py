@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
         except ElasticError as error:
             said = f"[bold red]error:[/] {escape(_with_notes(error))}"
             Console(stderr=True).print(said, highlight=False, soft_wrap=True)
-            sys.exit(2)
+            sys.exit(error.exit_code)
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"

@@ -1,9 +1,9 @@
 """What can go wrong with hardware; every message names the port and says what to do."""
 
-from elastic_env.errors import ElasticError
+from elastic_env.errors import SystemFailedError
 
 
-class HardwareError(ElasticError):
+class HardwareError(SystemFailedError):
     """Base of the errors of hardware: wrong servo, wrong setting, no reply, no permission."""
 
 
