@@ -29,10 +29,17 @@ class Rows:
         """The rows of several records, one record after the other."""
 
         def together(parts: list[Any]) -> Any:
-            return type(parts[0]).joined(parts) if isinstance(parts[0], Rows) else np.concatenate(parts)
+            return type(parts[0]).joined(parts) if isinstance(parts[0], Rows) else _concatenated(parts)
 
         return cls(*(together([getattr(record, name) for record in records]) for name in cls._names()))
 
     @classmethod
     def _names(cls) -> list[str]:
         return [field.name for field in fields(cls)]  # type: ignore[arg-type]
+
+
+def _concatenated(parts: list[Any]) -> Any:
+    """Arrays one after the other; structured ones by their bytes, as NumPy would compare their fields for each part."""
+    if parts[0].dtype.names is None:
+        return np.concatenate(parts)
+    return np.frombuffer(b"".join(parts), parts[0].dtype)

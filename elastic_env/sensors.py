@@ -1,5 +1,7 @@
 """What a robot measures: motor encoders with counts, an attitude sensor with noise, bias and a rate of its own."""
 
+from typing import Any
+
 import numpy as np
 
 from elastic_env.config import Model, quantity
@@ -72,11 +74,16 @@ class NoiseStream:
     """Standard normal samples, one independent stream per world, drawn in blocks.
 
     World i's samples depend on its generator and on how many it has used, never on the other worlds.
+
+    Args:
+        num_worlds: How many.
+        kind: Structured type of a sample, of real numbers alone.
+        block: Samples that are drawn at once.
     """
 
-    def __init__(self, num_worlds: int, width: int, block: int = 250) -> None:
+    def __init__(self, num_worlds: int, kind: np.dtype[Any], block: int = 250) -> None:
         # samples of a time are neighbours in memory: worlds mostly use theirs together
-        self._samples = np.zeros((block, num_worlds, width))
+        self._samples = np.zeros((block, num_worlds), kind)
         self._used, self._world = np.zeros(num_worlds, dtype=np.int64), np.arange(num_worlds)
         self._most_used = 0
         self._generators: list[np.random.Generator] = [np.random.default_rng(0) for _ in range(num_worlds)]
@@ -86,20 +93,19 @@ class NoiseStream:
         self._generators[world] = generator
         self._refill(world)
 
-    def next(self, worlds: BoolArray) -> Array:
-        """The next sample of some worlds, (num_worlds, width); the rows of the others are not to be used."""
+    def next(self, worlds: BoolArray) -> Any:
+        """The next sample of some worlds, (num_worlds,); the rows of the others are not to be used."""
         samples, used = self.ready()
-        at = np.minimum(used, len(samples) - 1) * len(self._world) + self._world
-        sample = samples.reshape(-1, samples.shape[2]).take(at, axis=0)
+        sample = samples[np.minimum(used, len(samples) - 1), self._world]
         used += worlds
         return sample
 
-    def ready(self) -> tuple[Array, IntArray]:
+    def ready(self) -> tuple[Any, IntArray]:
         """Samples ahead, at least one of each world, for one step.
 
         Returns:
-            (block, num_worlds, width), and how many of each world's are used, (num_worlds,): its next one has that
-            number, and counting it is for the caller.
+            (block, num_worlds), and how many of each world's are used, (num_worlds,): its next one has that number, and
+            counting it is for the caller.
         """
         block = len(self._samples)
         if self._most_used >= block:
@@ -110,5 +116,7 @@ class NoiseStream:
         return self._samples, self._used
 
     def _refill(self, world: int) -> None:
-        self._samples[:, world] = self._generators[world].standard_normal((len(self._samples), self._samples.shape[2]))
+        kind = self._samples.dtype
+        drawn = self._generators[world].standard_normal((len(self._samples), kind.itemsize // 8))
+        self._samples[:, world] = drawn.view(kind)[:, 0]
         self._used[world] = 0

@@ -21,8 +21,7 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env import compiled as module
 from elastic_env import metrics, worlds
 from elastic_env.compiled import compiled
-from elastic_env.tasks import walk_state, walk_step
-from elastic_env.walking import ground_contact
+from elastic_env.walking import kernels
 
 TWICE = """
 import numpy as np
@@ -201,29 +200,31 @@ def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, m
     """Catches code that is compiled to something else, and what was compiled before a change."""
     worlds = gymnasium.make_vec("elastic_env/WalkInPlace-v0", num_envs=2, scenario=scenario)
     worlds.reset(seed=4)
-    ran: Callable[..., bool] = walk_step.control_step
+    ran: Callable[..., bool] = kernels.control_step
     for _ in range(700):  # into the first swing
         worlds.step(np.zeros((2, 12), dtype=np.float32))
     steps = 0
 
-    def both(*arguments: Any) -> bool:
+    def both(physics: Any, walker: Any, noise: Any, *arguments: Any) -> bool:
         nonlocal steps
-        given, outcome = list(arguments[:-4]), arguments[-4:]
-        interpreted, plain = copy.deepcopy(given), copy.deepcopy(outcome)
-        is_over = ran(*arguments)
+        interpreted = copy.deepcopy((physics, walker, noise, *arguments))
+        is_over = ran(physics, walker, noise, *arguments)
         with pytest.MonkeyPatch.context() as uncompiled:
-            for owner in (walk_step, walk_state, ground_contact):
-                for name, function in vars(owner).items():
-                    if hasattr(function, "py_func"):
-                        uncompiled.setattr(owner, name, function.py_func)
-            assert ran.py_func(*interpreted, *plain) == is_over  # type: ignore[attr-defined]
-        for mine, expected in zip(outcome, plain, strict=True):
-            np.testing.assert_allclose(mine, expected, rtol=1e-13, atol=1e-13)
-        np.testing.assert_array_equal(given[5], interpreted[5])  # samples of noise that are used
+            for name, function in vars(kernels).items():
+                if hasattr(function, "py_func"):
+                    uncompiled.setattr(kernels, name, function.py_func)
+            assert ran.py_func(*interpreted) == is_over  # type: ignore[attr-defined]
+        _, rows, outcome = arguments[-3:]
+        _, plain_rows, plain = interpreted[-3:]
+        for mine, expected in ((rows, plain_rows), (outcome.observed, plain.observed)):
+            np.testing.assert_allclose(mine.view(np.float64), expected.view(np.float64), rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(outcome.reward, plain.reward, rtol=1e-13)
+        np.testing.assert_array_equal(outcome.ends, plain.ends)
+        np.testing.assert_array_equal(noise.used, interpreted[2].used)
         steps += 1
         return is_over
 
-    monkeypatch.setattr(walk_step, "control_step", both)
+    monkeypatch.setattr(kernels, "control_step", both)
     for k in range(20):
         worlds.step(np.full((2, 12), 0.01 * np.sin(k), dtype=np.float32))
     assert steps == 20

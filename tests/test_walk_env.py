@@ -24,7 +24,7 @@ from elastic_env.scenario import make_scenario
 from elastic_env.signals import Array
 from elastic_env.tasks import walk_config, walk_in_place
 from elastic_env.tasks.walk_config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
-from elastic_env.tasks.walk_step import tilt_penalty, zmp_penalty
+from elastic_env.walking.kernels import tilt_penalty, zmp_penalty
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/WalkInPlace-v0"

@@ -86,7 +86,8 @@ def restore(value: Any, state: Any) -> Any:
         old = value if isinstance(value, list) and len(value) == len(state) else [None] * len(state)
         return [restore(mine, part) for mine, part in zip(old, state, strict=True)]
     if isinstance(state, np.ndarray):
-        return state.copy()  # not in place: what was one array may have become two
+        # not in place: what was one array may have become two; a file does not keep the class of rows with fields
+        return state.astype(value.dtype) if isinstance(value, np.ndarray) and state.dtype.names else state.copy()
     return state
 
 

@@ -73,7 +73,7 @@ class SupportChanges:
             step: Its number, 0 at the start of the episodes.
             q_estimate: Joint angles as the policy sees them, (num_worlds, 12) [rad].
             observation: What it saw, (num_worlds, m).
-            truth: True state at that time, an `elastic_env.tasks.walk_state.WalkTruth`.
+            truth: True state at that time, an `elastic_env.tasks.walk_rows.WalkTruth`.
         """
         if step not in self._changes:
             return

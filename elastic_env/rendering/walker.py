@@ -28,7 +28,7 @@ from elastic_env.rendering.picture import ModelPicture
 from elastic_env.robots.thormang import LEG_JOINTS
 from elastic_env.signals import Array, Signals
 from elastic_env.tasks.walk_in_place import WalkTask
-from elastic_env.tasks.walk_state import WalkTruth
+from elastic_env.tasks.walk_rows import WalkTruth
 from elastic_env.tasks.walk_tables import FELL
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.contact_force import shares

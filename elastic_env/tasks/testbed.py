@@ -70,6 +70,9 @@ OBSERVATION = SignalTable(
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link")
 
+NOISE = np.dtype([("imu", np.float64)])
+"""A sample of noise [1]."""
+
 METRICS = (
     *(Metric(f"link_error_{s}_rad", "link_error", s) for s in ("rms", "peak", "min", "max")),
     *(Metric(f"link_error_imu_{s}_rad", "link_error_imu", s) for s in ("rms", "min", "max")),
@@ -172,7 +175,7 @@ class TestbedTask:
         self._true_model = config.robot_model(self._joint, self._pendulum, self.observation_table)
         self.model = elastic_spec(self._pendulum, self._joint, config.form, config.timestep_s).compile()
         self._at = JointAddresses.of(self.model, [JOINT])
-        self._noise = NoiseStream(num_worlds, width=1)
+        self._noise = NoiseStream(num_worlds, NOISE)
         self._reference = PlanTable(config.reference, config.control_period_s, num_worlds)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._theta, self._theta_dot, self._q, self._q_dot = np.zeros((4, num_worlds))
@@ -310,7 +313,7 @@ class TestbedTask:
         scenario, last = self.config.scenario, self._measured
         counts = self._joint.encoder_counts_per_turn if scenario.encoder_counts else None
         due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
-        imu = attitude(scenario.imu, self._q, self._imu_bias, self._noise.next(due)[:, 0])
+        imu = attitude(scenario.imu, self._q, self._imu_bias, self._noise.next(due)["imu"])
         return Measurement(
             encoder=np.where(worlds, quantise(self._theta + self._encoder_bias, counts), last.encoder),
             encoder_before=np.where(worlds, last.encoder, last.encoder_before),

@@ -55,7 +55,6 @@ plan's world frame, x forward, y to the left:
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,6 @@ from elastic_env.scenario import Scenario
 from elastic_env.sensors import NoiseStream, angle_of_count, is_due
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.simulation import Simulation, substeps
-from elastic_env.tasks import walk_step
 from elastic_env.tasks.task import Outcome
 from elastic_env.tasks.walk_config import (
     FALL_HEIGHT_SHARE,
@@ -79,29 +77,30 @@ from elastic_env.tasks.walk_config import (
     robot_bank,
     spring_ids,
 )
-from elastic_env.tasks.walk_state import (
-    COMMAND,
-    COMMAND_RATE,
-    CONTACT_SINCE,
-    ENCODER,
-    ENCODER_BEFORE,
-    IMU_ATTITUDE,
-    JOINTS,
-    OFFSET,
-    RECORD_END,
-    REWARD_TERMS,
-    STIFFNESS,
-    WalkRecord,
+from elastic_env.tasks.walk_rows import (
+    ADDRESSES,
+    BIAS,
+    CONSTANTS,
+    NOISE,
+    OBSERVED,
+    QUALITY,
+    ROW_OF_PLAN,
+    RULES,
+    SCORES,
+    STEP,
+    Records,
+    WalkSample,
     WalkTruth,
-    highest,
-    rms,
-    rotation_of,
+    one,
 )
 from elastic_env.tasks.walk_tables import ACTION, FELL, METRICS, OBSERVATION, PHASES
+from elastic_env.walking import kernels
 from elastic_env.walking.gait import LEFT, RIGHT
 from elastic_env.walking.ground_contact import FootSensors
 from elastic_env.walking.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 
+FELL_ROW, NUM_ENDS = 1, 4
+"""Of what ends an episode, beside `elastic_env.tasks.task.DIVERGED_ROW` and those after it."""
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
@@ -128,10 +127,6 @@ class WalkTask:
         require_feasible(self.plan, robot, model.servos)
         self._true_model = _true_model(config, self.plan)
         self.model = config.true_model()
-        at = JointAddresses.of(self.model, LEG_JOINTS)
-        # motor sides, link sides, the pelvis
-        positions = np.concatenate([at.theta, at.q, np.arange(7)])
-        velocities = np.concatenate([at.theta_dot, at.q_dot, np.arange(3, 6)])
         self._bank = robot_bank(config.scenario, config.bank)
         self._springs = spring_ids(self.model) if config.form == "tendon" else None
         feet = [self.model.body(f"{side}_foot").id for side in SIDES]
@@ -141,110 +136,104 @@ class WalkTask:
         weight = float(self.model.body_mass.sum()) * robot.gravity
         # sensors that carry nothing stand for a ground that carries the feet
         least_n = UNLOADED_SHARE * weight + float(self.model.body_mass[feet].sum()) * robot.gravity
-        self._addresses = np.concatenate([positions, velocities, sites])
-        self._feet = np.array([sensors.com, sensors.weight])
         n, m = num_worlds, len(LEG_JOINTS)
         self.num_steps = self.plan.num_steps
         """Control steps of an episode."""
-        imu, reward = config.scenario.pelvis_imu, config.reward
-        self._phases, self._rows = _phase_rows(self.plan), _plan_rows(self.plan, config)
-        self._limits = (
-            config.control_period_s, FALL_HEIGHT_SHARE * config.gait.hip_height_m, FALL_TILT_RAD,
-            UNLOADED_SHARE * weight, least_n,
+        self._phases, self._bias = _phase_rows(self.plan), np.zeros(n, BIAS)
+        joints = JointAddresses.of(self.model, LEG_JOINTS)
+        at = one(
+            ADDRESSES, theta=joints.theta, q=joints.q, theta_dot=joints.theta_dot, q_dot=joints.q_dot, ankles=sites
+        )
+        self._constants = one(
+            CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
+            quality=_quality(config.scenario, self._true_model.encoder_counts_per_turn),
+            rules=_rules(config, UNLOADED_SHARE * weight, least_n),
         )  # fmt: skip
-        self._weights = reward.tilt, reward.zmp, reward.effort, reward.smoothness, reward.fall
+        self._plan_rows = _plan_rows(self.plan, config)
         self._draw = np.zeros(n, dtype=np.int64)
         self._damping = self._true_model.damping
         self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
-        self._bias = np.zeros((n, m + 2))
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
-        self._noise_spread = _noise_spread(config.scenario)
-        self._noise = NoiseStream(n, width=len(self._noise_spread))
-        counted = self._true_model.encoder_counts_per_turn if config.scenario.encoder_counts else None
-        self._sensors = angle_of_count(counted), imu.noise_rad, imu.bias_rad, imu.sine_error_rad
-        self._record = self._shown = np.zeros((n, RECORD_END))
+        self._noise = NoiseStream(n, NOISE)
+        self._rows = self._shown = np.zeros(n, STEP)
         self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
-        for table in (
-            self._phases, self._addresses, self._feet, self._rows, self._noise_spread,
-        ):  # fmt: skip
-            table.flags.writeable = False
+        self._phases.flags.writeable = False
 
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place robots in static equilibrium under zero offset."""
         scenario = self.config.scenario
-        simulation.views(_PHYSICS)
+        simulation.views(kernels.Physics._fields)
         simulation.bind("xfrc_applied")[worlds] = 0.0
-        record = self._record.copy()  # the samples of the steps before keep theirs
-        record[worlds, OFFSET:] = 0.0
-        record[worlds, COMMAND:COMMAND_RATE] = self.plan.q[0]
-        record[worlds, CONTACT_SINCE] = -1.0
+        # the samples of the steps before keep theirs
+        rows = self._rows.copy()
+        rows["scores"][worlds] = np.zeros((), SCORES)
+        truth = rows["truth"]
+        truth["step"][worlds], truth["contact_since"][worlds] = 0, -1
+        truth["offset"][worlds], truth["command_rate"][worlds] = 0.0, 0.0
+        truth["command"][worlds] = self.plan.q[0]
         for world in np.flatnonzero(worlds).tolist():
             generator = generators[world]
             self._draw[world] = generator.integers(len(self._bank))
-            self._bias[world, JOINTS:] = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+            self._bias["imu_attitude"][world] = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
             self._draw_push(world, generator)
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
-            record[world, STIFFNESS:OFFSET] = self._place(simulation, world)
+            truth["stiffness"][world] = self._place(simulation, world)
         simulation.refresh(worlds)
-        physics, due = simulation.views(_PHYSICS), np.ones(self.num_worlds, dtype=np.bool_)
-        walk_step.read(physics, self._addresses, self._feet, self._limits[-1], worlds, self._record, record)
-        walk_step.measure(*self._measuring(), worlds, due, self._record, record)
-        record[worlds, ENCODER_BEFORE:IMU_ATTITUDE] = record[worlds, ENCODER:ENCODER_BEFORE]
-        self._record, self._has_fallen = record, self._has_fallen & ~worlds
-        self._shown = np.where(worlds[:, None], record, self._shown)
+        kernels.begin(self._physics(simulation), self._walker, self._ready(), worlds, rows)
+        self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
+        self._shown = np.where(worlds, rows, self._shown)
 
     def command(self, offset: Array, inputs: Array) -> None:
         """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
         self._offset = offset
-        walk_step.command(self._record, offset, self._rows, self._bias, inputs)
+        kernels.command(self._rows, offset, self._walker, inputs)
 
     def disturb(self, simulation: Simulation) -> None:
         """Push the torso where and when the scenario says."""
         if self.config.scenario.push_n > 0.0:
             steps = round(self.config.scenario.push_s / self.config.control_period_s)
-            since = WalkRecord(self._record).step - self._push_begin
+            since = self._rows["truth"]["step"] - self._push_begin
             active = (since >= 0) & (since < steps)
             simulation.bind("xfrc_applied")[:, self._torso, :3] = np.where(active[:, None], self._push_force, 0.0)
 
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
         """Read the new state, then what the sensors show of it; score it."""
-        is_delayed, last, n = self.config.scenario.delay_steps > 0, self._record, self.num_worlds
-        record, observation = np.empty((n, RECORD_END)), np.empty((n, len(OBSERVATION)))
-        reward, ends = np.empty(n), np.empty((walk_step.NUM_ENDS, n), dtype=np.bool_)
-        is_over = walk_step.control_step(
-            simulation.views(_PHYSICS), self._addresses, self._feet, self._rows, *self._measuring(), self._limits,
-            self._weights, self._offset, diverged, last, is_delayed, record, observation, reward, ends,
-        )  # fmt: skip
-        self._record, self._shown, self._has_fallen = record, last if is_delayed else record, ends[walk_step.FELL_ROW]
-        return Outcome(observation, WalkRecord(record), reward, ends, is_over)
+        n, last, rows = self.num_worlds, self._rows, np.empty(self.num_worlds, STEP)
+        outcome = kernels.Outcome(np.empty(n, OBSERVED), np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_))
+        commanded = self._offset, diverged
+        is_over = kernels.control_step(
+            self._physics(simulation), self._walker, self._ready(), commanded, last, rows, outcome
+        )
+        self._rows, self._shown = rows, last if self.config.scenario.delay_steps > 0 else rows
+        self._has_fallen = outcome.ends[FELL_ROW]
+        return Outcome(_columns(outcome.observed), WalkSample(rows), outcome.reward, outcome.ends, is_over)
 
     def observe(self) -> Array:
         """See the table of the module."""
-        observation = np.empty((self.num_worlds, len(OBSERVATION)))
-        walk_step.observe(self._record, self._shown, self._rows, self.config.control_period_s, observation)
-        return observation
+        observed = np.empty(self.num_worlds, OBSERVED)
+        kernels.show(self._rows, self._shown, self._walker, observed)
+        return _columns(observed)
 
-    def sample(self) -> WalkRecord:
+    def sample(self) -> WalkSample:
         """What this step is scored by."""
-        return WalkRecord(self._record)
+        return WalkSample(self._rows)
 
-    def signals(self, sample: WalkRecord) -> Signals:
+    def signals(self, sample: WalkSample) -> Signals:
         """Truth and scores of samples, one value per row."""
-        row, plan, timing = self._row(sample), self.plan, self.plan.timing
-        error, deflection = plan.q[row] - sample.q, sample.theta - sample.q
-        deflection_rate = sample.theta_dot - sample.q_dot
-        torque = joint_torque(deflection, deflection_rate, sample.stiffness, self._damping, self._backlash)
+        truth, row, plan, timing = sample.rows["truth"], self._row(sample), self.plan, self.plan.timing
+        error, deflection = plan.q[row] - truth["q"], truth["theta"] - truth["q"]
+        deflection_rate = truth["theta_dot"] - truth["q_dot"]
+        torque = joint_torque(deflection, deflection_rate, truth["stiffness"], self._damping, self._backlash)
         zmp_ref = plan.zmp[row]
-        deviation = sample.zmp - zmp_ref
-        roll, pitch, tilt = sample.attitude.T.copy()
+        deviation = truth["zmp"] - zmp_ref
         return {
-            "time_s": sample.step * self.config.control_period_s,
-            "pelvis_roll": roll,
-            "pelvis_pitch": pitch,
-            "pelvis_error": tilt,
-            "pelvis_height": sample.pelvis[:, 2].copy(),
-            "zmp_x": sample.zmp[:, 0].copy(),
-            "zmp_y": sample.zmp[:, 1].copy(),
+            "time_s": truth["step"] * self.config.control_period_s,
+            "pelvis_roll": truth["roll"].copy(),
+            "pelvis_pitch": truth["pitch"].copy(),
+            "pelvis_error": truth["tilt"].copy(),
+            "pelvis_height": truth["pelvis"][:, 2].copy(),
+            "zmp_x": truth["zmp"][:, 0].copy(),
+            "zmp_y": truth["zmp"][:, 1].copy(),
             "zmp_reference_x": zmp_ref[:, 0],
             "zmp_reference_y": zmp_ref[:, 1],
             "zmp_deviation": np.hypot(deviation[:, 0], deviation[:, 1]),
@@ -255,24 +244,24 @@ class WalkTask:
             "link_error_highest": highest(error),
             "deflection": rms(deflection),
             "joint_torque": highest(np.abs(torque)),
-            "servo_torque": rms(sample.servo_torque),
-            "command_rate": sample.command_rate.copy(),
-            "force_left": sample.force[:, LEFT].copy(),
-            "force_right": sample.force[:, RIGHT].copy(),
+            "servo_torque": rms(truth["servo_torque"]),
+            "command_rate": truth["command_rate"].copy(),
+            "force_left": truth["force"][:, LEFT].copy(),
+            "force_right": truth["force"][:, RIGHT].copy(),
             "load_share": plan.share[row],
             "swing": timing.swing[row],
             "single_support": timing.single[row],
             "support": timing.support[row],
-            "early_touchdown": self._earliness(sample),
+            "early_touchdown": self._earliness(truth, row),
         }
 
-    def reward_terms(self, sample: WalkRecord) -> dict[str, Array]:
+    def reward_terms(self, sample: WalkSample) -> dict[str, Array]:
         """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
-        return dict(zip(REWARD_TERMS, sample.scores.T.copy(), strict=True))
+        return {name: sample.rows["scores"][name].copy() for name in SCORES.names or ()}
 
-    def masks(self, sample: WalkRecord) -> dict[str, BoolArray]:
+    def masks(self, sample: WalkSample) -> dict[str, BoolArray]:
         """The walk (standing before and after it does not count), its phases, and where there is a ZMP."""
-        loaded = ~np.isnan(sample.zmp[:, 0])
+        loaded = ~np.isnan(sample.rows["truth"]["zmp"][:, 0])
         phases = self._phases[:, self._row(sample)]
         names = [f"{name}_loaded" for name in PHASES]
         return {
@@ -287,18 +276,25 @@ class WalkTask:
 
     def truth(self) -> WalkTruth:
         """State without noise, and the true parameters."""
-        s = WalkRecord(self._record)
-        pelvis_R = rotation_of(s.quaternion)
-        copies = (x.copy() for x in (s.theta, s.theta_dot, s.q, s.q_dot, s.pelvis, pelvis_R, s.ankles, s.stiffness))
-        return WalkTruth(*copies, model=self._true_model)
+        s = self._rows["truth"]
+        names = "theta", "theta_dot", "q", "q_dot", "pelvis", "ankles", "stiffness"
+        copies = {name: s[name].copy() for name in names}
+        return WalkTruth(**copies, pelvis_R=rotation_of(s["quaternion"]), model=self._true_model)
 
-    def _row(self, sample: WalkRecord) -> IntArray:
+    def _row(self, sample: WalkSample) -> IntArray:
         """Rows of the plan's tables."""
-        return np.minimum(sample.step, self.num_steps)
+        return np.minimum(sample.rows["truth"]["step"], self.num_steps)
 
-    def _measuring(self) -> tuple[Array, IntArray, Array, Array, Any]:
-        """Noise and errors of the sensors, of `walk_step.measure`."""
-        return *self._noise.ready(), self._noise_spread, self._bias, self._sensors
+    def _physics(self, simulation: Simulation) -> kernels.Physics:
+        return kernels.Physics(*simulation.views(kernels.Physics._fields))
+
+    @property
+    def _walker(self) -> kernels.Walker:
+        return kernels.Walker(self._constants, self._plan_rows, self._bias)
+
+    def _ready(self) -> kernels.Noise:
+        """Noise of the sensors ahead."""
+        return kernels.Noise(*self._noise.ready())
 
     def _draw_push(self, world: int, generator: np.random.Generator) -> None:
         """Time and direction of the push, in the walk."""
@@ -311,7 +307,7 @@ class WalkTask:
     def _place(self, simulation: Simulation, world: int) -> Array:
         """Give a world its robot, at rest; its true K, (12,) [N·m/rad]."""
         scenario, draw = self.config.scenario, self._bank[self._draw[world]]
-        self._bias[world, :JOINTS] = draw.encoder_bias_rad
+        self._bias["encoder"][world] = draw.encoder_bias_rad
         stiffness = self._true_model.stiffness * np.array(draw.stiffness_factor)
         if scenario.stiffness_spread > 0.0 and self._springs is not None:
             simulation.vary("tendon_stiffness")[world, self._springs] = stiffness
@@ -322,27 +318,27 @@ class WalkTask:
         simulation.qpos[world] = rest.qpos
         simulation.qvel[world] = 0.0
         simulation.act[world] = rest.act
-        simulation.ctrl[world] = self.plan.q[0] - self._bias[world, :JOINTS]
+        simulation.ctrl[world] = self.plan.q[0] - self._bias["encoder"][world]
         simulation.bind("qacc_warmstart")[world] = rest.warmstart
         return stiffness
 
-    def _earliness(self, sample: WalkRecord) -> Array:
+    def _earliness(self, truth: Records, row: IntArray) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
-        early = (sample.step - sample.contact_since) * self.config.control_period_s
-        is_touchdown = self._phases[TOUCHDOWN, self._row(sample)]
-        return np.where(is_touchdown & (sample.contact_since >= 0), early, 0.0)
+        early = (truth["step"] - truth["contact_since"]) * self.config.control_period_s
+        return np.where(self._phases[TOUCHDOWN, row] & (truth["contact_since"] >= 0), early, 0.0)
 
 
-def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Array:
-    """What a control step needs of the plan, one row per step, up to `walk_step.PLAN_END`."""
+def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
+    """What a control step needs of the plan, one row per step."""
     timing, steps = plan.timing, np.arange(plan.num_steps + 1)
-    clock = [timing.time, timing.swing, timing.support, plan.share]
-    imu_is_due = is_due(steps, config.scenario.pelvis_imu.rate_hz, config.control_period_s)
-    weight = np.where(timing.walking, 1.0, config.reward.standing)
-    marks = [_halves_of_swing(plan), RIGHT - timing.support, imu_is_due, weight]
-    columns = [plan.q, plan.q_dot, plan.q_ddot, *clock, plan.zmp, *marks]
-    rows = np.column_stack([np.asarray(column, dtype=np.float64) for column in columns])
-    assert rows.shape[1] == walk_step.PLAN_END  # compiled code does not look
+    rows = np.zeros(len(steps), ROW_OF_PLAN)
+    rows["q"], rows["q_dot"], rows["q_ddot"] = plan.q, plan.q_dot, plan.q_ddot
+    rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
+    rows["share"], rows["zmp"] = plan.share, plan.zmp
+    rows["half_of_swing"], rows["swing_foot"] = _halves_of_swing(plan), RIGHT - timing.support
+    rows["imu_is_due"] = is_due(steps, config.scenario.pelvis_imu.rate_hz, config.control_period_s)
+    rows["weight"] = np.where(timing.walking, 1.0, config.reward.standing)
+    rows.flags.writeable = False
     return rows
 
 
@@ -358,13 +354,33 @@ def _phase_rows(plan: WalkPlan) -> BoolArray:
 def _halves_of_swing(plan: WalkPlan) -> IntArray:
     """Which half of a swing a control step is in, 0 for none."""
     timing = plan.timing
-    return np.where(timing.single, np.where(timing.swing > 0.5, walk_step.SECOND_HALF, walk_step.FIRST_HALF), 0)
+    return np.where(timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0)
 
 
-def _noise_spread(scenario: Scenario) -> Array:
-    """Standard deviations of gyroscope and foot sensors, (17,); the attitude sensor scales its noise itself."""
-    wrench = [scenario.force_noise_n] * 3 + [scenario.moment_noise_nm] * 3
-    return np.array([0.0] * 2 + [scenario.gyro_noise_rad_s] * 3 + wrench * 2)
+def _columns(observed: Records) -> Array:
+    """Rows of `OBSERVED` as the columns of an observation, (n, 95)."""
+    return observed.view(np.float64).reshape(len(observed), -1)
+
+
+def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
+    """Numbers that judge a control step, one row of `RULES`."""
+    weights = one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()})
+    return one(
+        RULES, control_period_s=config.control_period_s, is_delayed=config.scenario.delay_steps > 0,
+        loaded_n=loaded_n, zmp_n=zmp_n, weights=weights,
+        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m, highest_tilt_rad=FALL_TILT_RAD,
+    )  # fmt: skip
+
+
+def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:
+    """Quality of the sensors in a scenario, one row of `QUALITY`."""
+    imu = scenario.pelvis_imu
+    return one(
+        QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None),
+        imu_noise_rad=imu.noise_rad, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
+        gyro_noise_rad_s=scenario.gyro_noise_rad_s, force_noise_n=scenario.force_noise_n,
+        moment_noise_nm=scenario.moment_noise_nm,
+    )  # fmt: skip
 
 
 def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
@@ -374,7 +390,25 @@ def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
     return WalkerModel(config.true_joints, true.rigid, config.control_period_s, OBSERVATION, biped=true, plan=plan)
 
 
-_PHYSICS = ("qpos", "qvel", "sensordata", "actuator_force", "site_xmat", "site_xpos")
-"""What `walk_step.read` reads."""
 TOUCHDOWN = -1
 """Row of the touch-downs among the phases."""
+
+
+def highest(values: Array) -> Array:
+    """Maximum over the last axis of (n, m); NumPy is several times as fast over a first axis."""
+    return values.T.copy().max(axis=0)
+
+
+def rms(values: Array) -> Array:
+    """Root of the mean square over the last axis of (n, m)."""
+    return kernels.rms_of_rows(values)
+
+
+def rotation_of(quaternion: Array) -> Array:
+    """Rotation of unit quaternions w, x, y, z, (n, 4) to (n, 3, 3)."""
+    w, x, y, z = quaternion.T
+    R = np.empty((len(quaternion), 3, 3))
+    R[:, 0, 0], R[:, 0, 1], R[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    R[:, 1, 0], R[:, 1, 1], R[:, 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    R[:, 2, 0], R[:, 2, 1], R[:, 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return R

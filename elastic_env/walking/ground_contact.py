@@ -9,8 +9,8 @@ taken about the origin on the ground, the ZMP is
 
 import numpy as np
 
-from elastic_env.compiled import compiled
 from elastic_env.signals import Array
+from elastic_env.walking.kernels import ground_wrenches, moment_points
 
 
 class FootSensors:
@@ -42,7 +42,7 @@ class FootSensors:
         """
         seen, R = _rows(np.broadcast_to(sensors, (*foot_R.shape[:-2], 2, 3)), 3), _rows(foot_R, 3)
         force, moment = np.empty(R.shape[:-1]), np.empty(R.shape[:-1])
-        _ground_wrenches(seen, R, self.com, self.weight, force, moment)
+        ground_wrenches(seen, R, self.com, self.weight, force, moment)
         shape = foot_R.shape[:-1]
         return force.reshape(shape), moment.reshape(shape)
 
@@ -61,50 +61,10 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
     """
     f, n, p = (_rows(values, 2) for values in np.broadcast_arrays(force, moment, ankle))
     zmp = np.empty((len(f), 2))
-    _moment_points(f, n, p, least_n, zmp)
+    moment_points(f, n, p, least_n, zmp)
     return zmp.reshape(*np.broadcast_shapes(force.shape, moment.shape, ankle.shape)[:-2], 2)
 
 
 def _rows(values: Array, axes: int) -> Array:
     """One row per robot: all but the last axes in one."""
     return np.ascontiguousarray(values).reshape(-1, *values.shape[-axes:])
-
-
-@compiled
-def ground_wrench(sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array) -> None:
-    """Wrench of the ground on the feet of one robot, see `FootSensors`: into `force` and `moment`, (L, 3)."""
-    c = np.empty(3)
-    for foot in range(len(sensors)):
-        R, (f, n), w = foot_R[foot], sensors[foot], weight[foot]
-        for i in range(3):
-            c[i] = R[i, 0] * com[foot, 0] + R[i, 1] * com[foot, 1] + R[i, 2] * com[foot, 2]
-            force[foot, i] = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2] - w[i]
-            moment[foot, i] = R[i, 0] * n[0] + R[i, 1] * n[1] + R[i, 2] * n[2]
-        moment[foot, 0] -= c[1] * w[2] - c[2] * w[1]
-        moment[foot, 1] -= c[2] * w[0] - c[0] * w[2]
-        moment[foot, 2] -= c[0] * w[1] - c[1] * w[0]
-
-
-@compiled
-def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
-    """ZMP of one robot, see `zero_moment_point`: into `zmp`, (2,)."""
-    about_x = about_y = vertical = 0.0
-    for foot in range(len(force)):
-        f, n, p = force[foot], moment[foot], ankle[foot]
-        about_x += p[1] * f[2] - p[2] * f[1] + n[0]
-        about_y += p[2] * f[0] - p[0] * f[2] + n[1]
-        vertical += f[2]
-    scale = vertical if vertical >= least_n else np.nan
-    zmp[0], zmp[1] = -about_y / scale, about_x / scale
-
-
-@compiled
-def _ground_wrenches(sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array) -> None:
-    for row in range(len(sensors)):
-        ground_wrench(sensors[row], foot_R[row], com, weight, force[row], moment[row])
-
-
-@compiled
-def _moment_points(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
-    for row in range(len(force)):
-        moment_point(force[row], moment[row], ankle[row], least_n, zmp[row])
