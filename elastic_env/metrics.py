@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from elastic_env.compiled import compiled
+from elastic_env.compiled import compile_now, compiled
 from elastic_env.signals import Array, BoolArray, Signals
 
 
@@ -98,7 +98,7 @@ class EpisodeMetrics:
         self._metrics = {name: own for name, own in by_statistic.items() if own}
         self._statistics = {name: RunningStatistic(name, len(m), num_worlds) for name, m in self._metrics.items()}
         none = np.zeros((1, num_worlds))
-        self.update({m.signal: none for m in metrics}, {m.over: none.astype(np.bool_) for m in metrics})
+        compile_now(self.update, {m.signal: none for m in metrics}, {m.over: none.astype(np.bool_) for m in metrics})
 
     def restart(self, worlds: BoolArray) -> None:
         """Begin new episodes in some worlds, (num_worlds,) mask."""

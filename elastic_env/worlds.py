@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from elastic_env.compiled import compiled
+from elastic_env.compiled import compile_now, compiled
 from elastic_env.errors import ActionError
 from elastic_env.metrics import EpisodeMetrics
 from elastic_env.rows import Rows
@@ -75,7 +75,7 @@ class Worlds:
         self._failures = (DIVERGED, *task.failure_names)
         self._no_reason = np.full(task.num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
-        self._checked(np.zeros(self._shape))  # compiles now what the first step of a motion could not wait for
+        compile_now(self._checked, np.zeros(self._shape))  # the first step of a motion cannot wait
 
     @property
     def num_worlds(self) -> int:

@@ -1,111 +1,87 @@
 """Compiled functions: the numbers that their Python code says, and nothing kept of code that has changed."""
 
+import ast
 import copy
-import importlib.util
+import importlib
 import os
-import pickle
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
+import numba
 import numpy as np
 import pytest
-from numba.core import caching
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env import compiled as module
 from elastic_env import metrics, worlds
-from elastic_env.compiled import compiled
+from elastic_env.compiled import compile_now, compiled
 from elastic_env.walking import kernels
 
-TWICE = """
-import numpy as np
-from elastic_env.compiled import compiled
-
-@compiled
-def twice(values):
-    return 2.0 * values
-"""
+ROOT = Path(__file__).parents[1]
+KERNELS = ("elastic_env.worlds", "elastic_env.metrics", "elastic_env.walking.kernels")
 
 
-def loaded(path: Path) -> Any:
-    """The function of a module that is loaded anew, as by a new program."""
-    spec = importlib.util.spec_from_file_location("module_of_twice", path)
-    assert spec is not None
-    assert spec.loader is not None
-    found = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(found)
-    return found.twice
+@pytest.mark.parametrize("name", KERNELS)
+def test_a_kernel_calls_functions_of_its_own_file_alone(name: str) -> None:
+    """Catches code that Numba keeps although what it calls, or a constant that it uses, has changed in another file."""
+    module = importlib.import_module(name)
+    tree = ast.parse(Path(str(module.__file__)).read_text())
+    imported = {
+        alias.asname or alias.name
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(("elastic_env", "baselines", "train"))
+        for alias in node.names
+    }
+    functions = [f for f in tree.body if isinstance(f, ast.FunctionDef) and f.decorator_list]
+    compiled_ones = [f for f in functions if ast.unparse(f.decorator_list[0]) == "compiled"]
+    assert compiled_ones
+    for function in compiled_ones:
+        used = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
+        assert not used & imported, function.name
 
 
-def hits(twice: Any) -> int:
-    """How much of what a function did was found compiled."""
-    assert twice(np.ones(2)).tolist() == [2.0, 2.0]
-    assert twice(1.0) == 2.0
-    return sum(twice.stats.cache_hits.values())
+def test_every_compiled_function_is_looked_at() -> None:
+    """Catches a kernel in a file that the test above does not know."""
+    files = [file for package in ("elastic_env", "baselines", "train") for file in (ROOT / package).rglob("*.py")]
+    found = {file for file in files if "\n@compiled" in file.read_text() or "numba.njit" in file.read_text()}
+    known = {ROOT / f"{name.replace('.', '/')}.py" for name in KERNELS}
+    assert found - {ROOT / "elastic_env" / "compiled.py"} == known
 
 
-def test_what_was_compiled_is_kept_until_any_module_of_the_package_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches a cache that knows a function's own file alone, and keeps old constants and callees, or old files."""
-    path = tmp_path / "module_of_twice.py"
-    path.write_text(TWICE)
-    found = []
-    for stamp in ("a", "a", "b", "b"):
-        monkeypatch.setattr(module, "_package_stamp", lambda stamp=stamp: stamp)
-        found.append(hits(loaded(path)))
-        assert len(list(tmp_path.rglob("*.nbc"))) == 2
-    assert found == [0, 2, 0, 2]
+def test_where_nothing_can_be_kept_it_works_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an environment that cannot be imported from a read-only disk."""
+    njit = module.numba.njit
+
+    def refusing(**options: Any) -> Any:
+        def decorate(function: Callable[..., Any]) -> Any:
+            if options.pop("cache", False):
+                raise RuntimeError("cannot cache function: no locator available")
+            return njit(**options)(function)
+
+        return decorate
+
+    monkeypatch.setattr(module, "numba", SimpleNamespace(njit=refusing))
+    assert compiled(lambda value: 2.0 * value)(1.5) == 3.0
 
 
-def test_what_was_not_kept_whole_is_compiled_again(tmp_path: Path) -> None:
-    """Catches a crash while writing that breaks every program from then on, and one type's code for another."""
-    path = tmp_path / "module_of_twice.py"
-    path.write_text(TWICE)
-    assert hits(loaded(path)) == 0
-    one, other = sorted(tmp_path.rglob("*.nbc"))
-    whole = one.read_bytes()
-    for damaged in (b"", whole[:100], other.read_bytes(), b"garbage\n\x00\xff", pickle.dumps(5)):
-        one.write_bytes(damaged)
-        assert hits(loaded(path)) == 1
-        assert one.read_bytes() != damaged
+def test_a_full_disk_costs_time_and_nothing_else() -> None:
+    """Catches an environment that fails because what was compiled cannot be kept."""
+    calls = []
 
+    def keep() -> None:
+        calls.append(1)
+        if len(calls) == 1:
+            raise OSError("no space left on device")
 
-@pytest.mark.parametrize("is_found_late", [False, True])
-def test_where_nothing_can_be_kept_it_works_all_the_same(
-    is_found_late: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches an environment that cannot be imported from a read-only disk, or that fails when the disk is full."""
-
-    def refuse(*_: Any) -> None:
-        raise OSError("read-only file system")
-
-    path = tmp_path / "module_of_twice.py"
-    path.write_text(TWICE)
-    twice = loaded(path) if is_found_late else None
-    monkeypatch.setattr(caching._CacheLocator, "ensure_cache_path", refuse)
-    assert hits(twice or loaded(path)) == 0
-    assert not list(tmp_path.rglob("*.nbc"))
-
-
-def test_the_stamp_of_the_package_changes_with_every_module(tmp_path: Path) -> None:
-    """Catches a stamp without the modules of sub-packages, or one that looks at their size or time alone."""
-    called = tmp_path / "tasks" / "called.py"
-    called.parent.mkdir()
-    stamps = set()
-    for text in ("A = 1", "A = 2", "A = 12"):
-        called.write_text(text)
-        os.utime(called, (0, 0))
-        stamps.add(module._stamp_of(tmp_path))
-    assert len(stamps) == 3
-    called.write_text("A = 1")
-    assert module._stamp_of(tmp_path) in stamps
+    compile_now(keep)
+    assert len(calls) == 2
 
 
 def test_without_the_compiler_it_works_all_the_same() -> None:
@@ -154,7 +130,7 @@ def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
             times += 1
             signal.raise_signal(signal.SIGINT)
 
-    @compiled
+    @numba.njit
     def twice(value: float) -> float:
         return 2.0 * value
 
@@ -162,7 +138,7 @@ def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
     threading.setprofile(interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):
-            twice(1.0)
+            compile_now(twice, 1.0)
     finally:
         sys.setprofile(None)
         threading.setprofile(None)

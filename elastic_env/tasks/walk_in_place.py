@@ -58,6 +58,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from elastic_env.compiled import compile_now
 from elastic_env.elasticity import joint_torque
 from elastic_env.metrics import Metric
 from elastic_env.robots.joint_names import JointAddresses
@@ -158,6 +159,7 @@ class WalkTask:
         self._rows = self._shown = np.zeros(n, STEP)
         self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
         self._phases.flags.writeable = False
+        self._is_compiled = False
 
     def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
         """Place robots in static equilibrium under zero offset."""
@@ -179,9 +181,23 @@ class WalkTask:
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
             truth["stiffness"][world] = self._place(simulation, world)
         simulation.refresh(worlds)
+        if not self._is_compiled:
+            compile_now(self._rehearse, simulation)
+            self._is_compiled = True
         kernels.begin(self._physics(simulation), self._walker, self._ready(), worlds, rows)
         self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
         self._shown = np.where(worlds, rows, self._shown)
+
+    def _rehearse(self, simulation: Simulation) -> None:
+        """Call all kernels on rows of their own."""
+        n, rows, samples = self.num_worlds, np.zeros((2, self.num_worlds), STEP), np.zeros((1, self.num_worlds), NOISE)
+        noise, physics = kernels.Noise(samples, np.zeros(n, dtype=np.int64)), self._physics(simulation)
+        commanded, outcome = (self._offset, np.zeros(n, dtype=np.bool_)), _outcome(n)
+        kernels.begin(physics, self._walker, noise, ~commanded[1], rows[0])
+        kernels.command(rows[0], self._offset, self._walker, np.zeros_like(simulation.ctrl))
+        kernels.control_step(physics, self._walker, noise, commanded, rows[0], rows[1], outcome)
+        kernels.show(rows[0], rows[1], self._walker, outcome.observed)
+        self.signals(WalkSample(rows[0]))
 
     def command(self, offset: Array, inputs: Array) -> None:
         """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
@@ -199,8 +215,7 @@ class WalkTask:
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
         """Read the new state, then what the sensors show of it; score it."""
         n, last, rows = self.num_worlds, self._rows, np.empty(self.num_worlds, STEP)
-        outcome = kernels.Outcome(np.empty(n, OBSERVED), np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_))
-        commanded = self._offset, diverged
+        outcome, commanded = _outcome(n), (self._offset, diverged)
         is_over = kernels.control_step(
             self._physics(simulation), self._walker, self._ready(), commanded, last, rows, outcome
         )
@@ -355,6 +370,11 @@ def _halves_of_swing(plan: WalkPlan) -> IntArray:
     """Which half of a swing a control step is in, 0 for none."""
     timing = plan.timing
     return np.where(timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0)
+
+
+def _outcome(n: int) -> kernels.Outcome:
+    """To be filled."""
+    return kernels.Outcome(np.empty(n, OBSERVED), np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_))
 
 
 def _columns(observed: Records) -> Array:
