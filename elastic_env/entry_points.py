@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -139,7 +140,7 @@ def _require_models(**arguments: tuple[Any, type[Any]]) -> None:
 def make_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
     config = _configure(configure_testbed, "elastic_env/Testbed-v0", arguments)
-    return ElasticEnv(TestbedTask(config, num_worlds=1), render_mode, lambda: TestbedPicture(config.pendulum))
+    return ElasticEnv(TestbedTask(config, num_worlds=1), render_mode, partial(TestbedPicture, config.pendulum))
 
 
 def make_testbed_vector(
@@ -159,7 +160,7 @@ def make_walk(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Entry point of `elastic_env/WalkInPlace-v0`; arguments as in `configure_walk`."""
     config = _configure(configure_walk, "elastic_env/WalkInPlace-v0", arguments)
     task = WalkTask(config, num_worlds=1)
-    return ElasticEnv(task, render_mode, lambda: WalkerPicture(task))
+    return ElasticEnv(task, render_mode, partial(WalkerPicture, task))
 
 
 def make_walk_vector(

@@ -107,6 +107,10 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
         return self._draw().rgb(self._worlds.signals()) if self.render_mode == "rgb_array" else None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but window and renderer, which are made again when they are needed."""
+        return {**vars(self), "_picture": None}
+
     def close(self) -> None:
         """Close the window, free the renderer, let hardware go."""
         self._worlds.simulation.close()

@@ -4,7 +4,9 @@ Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control
 """
 
 import copy
+import ctypes
 import os
+import warnings
 from typing import Any, Protocol
 
 import mujoco
@@ -12,7 +14,7 @@ import numpy as np
 from mujoco import batch
 
 from elastic_env.errors import ConfigurationError
-from elastic_env.signals import Array, BoolArray
+from elastic_env.signals import Array, BoolArray, IntArray
 
 
 class Simulation(Protocol):
@@ -54,7 +56,7 @@ class Simulation(Protocol):
         ...
 
     def diverged(self) -> BoolArray:
-        """Worlds in which MuJoCo warned of a bad number since their restart, (num_worlds,)."""
+        """Worlds whose state, acceleration or control has been a bad number since their restart, (num_worlds,)."""
         ...
 
     def close(self) -> None:
@@ -62,23 +64,54 @@ class Simulation(Protocol):
         ...
 
 
+DIVERGED_RAD_S = 1e3
+"""Speed of a joint beyond anything physical [rad/s]: two hundred times the no-load speed of the servos."""
+
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
+_FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{what}FULL")) for what in ("CONTACT", "CNSTR")]
+
+
+class _Warnings:
+    """What MuJoCo warns of: bad numbers, which end an episode, and anything else, which is said once."""
+
+    def __init__(self) -> None:
+        self._said: set[int] = set()
+
+    def diverged(self, counts: IntArray) -> BoolArray:
+        """Worlds with a bad number, from the counts of all warnings, (num_worlds, kinds)."""
+        if not counts.any():
+            return np.zeros(len(counts), dtype=np.bool_)
+        for kind in np.flatnonzero(counts.any(axis=0)).tolist():
+            if kind not in _BAD and kind not in self._said:
+                self._said.add(kind)
+                warnings.warn(_explain(kind), RuntimeWarning, stacklevel=2)
+        return counts[:, _BAD].any(axis=1)
+
+
+def _explain(kind: int) -> str:
+    """A warning of MuJoCo, and what to change."""
+    cure = 'give the model a larger arena: <size memory="..."/>' if kind in _FULL else "look at the model's inertias"
+    return f"MuJoCo warns: {mujoco.mju_warningText(kind, 0)}. The simulation goes on, less exact; {cure}"
+
+
 class SingleWorld:
     """One world on `mj_step`."""
 
+    num_worlds = 1
+
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.model = model
-        self.num_worlds = 1
-        self._varies = False
-        self._data = mujoco.MjData(model)
-        self._warnings, self._views = self._data.warning.number, dict[tuple[str, ...], tuple[Array, ...]]()
+        self.__setstate__({"model": model, "varies": False, "data": mujoco.MjData(model), "warnings": _Warnings()})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the live views, for `copy.deepcopy` and pickle."""
+        return {"model": self.model, "varies": self._varies, "data": self._data, "warnings": self._warnings}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.model, self._varies = state["model"], state["varies"]
+        self._data, self._warnings = state["data"], state["warnings"]
+        self._counts, self._views = self._data.warning.number[None], dict[tuple[str, ...], tuple[Array, ...]]()
         self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
         self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "SingleWorld":
-        copied = SingleWorld(copy.copy(self.model) if self._varies else self.model)
-        copied._varies = self._varies
-        mujoco.mj_copyData(copied._data, self.model, self._data)
-        return copied
 
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
@@ -112,7 +145,7 @@ class SingleWorld:
 
     def diverged(self) -> BoolArray:
         """See `Simulation`."""
-        return np.array([np.count_nonzero(self._warnings) > 0])
+        return self._warnings.diverged(self._counts)
 
     def close(self) -> None:
         """See `Simulation`; there is nothing to give back."""
@@ -122,24 +155,36 @@ class ManyWorlds:
     """Many worlds on `mujoco.batch`, stepped by a pool of threads."""
 
     def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> None:
-        self.model = model
-        self.num_worlds = num_worlds
+        threads = min(num_threads or os.cpu_count() or 1, num_worlds)
+        self._start(model, num_worlds, threads, _Warnings())
+
+    def _start(self, model: mujoco.MjModel, num_worlds: int, num_threads: int, said: _Warnings) -> None:
+        """Begin with worlds in the model's default state, and threads of this process."""
+        self.model, self.num_worlds, self._warnings, self._process = model, num_worlds, said, os.getpid()
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views: dict[tuple[str, ...], tuple[Array, ...]] = {}
-        self._batch = batch.Batch(model, nsim=num_worlds, nthread=min(num_threads or os.cpu_count() or 1, num_worlds))
+        self._batch = batch.Batch(model, nsim=num_worlds, nthread=num_threads)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ManyWorlds":
-        copied = ManyWorlds(self.model, self.num_worlds, self._batch.nthread)
-        for field in self._varied:
-            copied.vary(field)[:] = self.vary(field)
-        for field in self._bound:
-            copied.bind(field)
-        copied._batch.state[:] = self._batch.state
-        copied._batch.warning[:] = self._batch.warning
-        return copied
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a process that was forked."""
+        made = (self.model, self.num_worlds, self._batch.nthread, self._warnings)
+        return {"made": made, "worlds": self.get_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._start(*state["made"])
+        self.set_state(state["worlds"])
+
+    def _own(self) -> batch.Batch:
+        """The batch, with threads of this process: those of a parent are not there after a fork."""
+        if self._process != os.getpid():
+            inherited = self._batch
+            # its end would wait for threads that are not there: it is never freed
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(inherited))
+            self.__setstate__(self.__getstate__())
+        return self._batch
 
     def get_state(self) -> dict[str, Any]:
         """Everything that goes on from here: integration states, outputs, warnings, varied fields of the model."""
@@ -175,21 +220,21 @@ class ManyWorlds:
 
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""
-        self._batch.step(nstep=num_substeps)
+        self._own().step(nstep=num_substeps)
 
     def restart(self, worlds: BoolArray) -> None:
         """See `Simulation`."""
         if worlds.any():
-            self._batch.reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+            self._own().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
 
     def refresh(self, worlds: BoolArray) -> None:
         """See `Simulation`."""
         if worlds.any():
-            self._batch.forward(worlds)
+            self._own().forward(worlds)
 
     def diverged(self) -> BoolArray:
         """See `Simulation`."""
-        return self._batch.warning[..., 1].any(axis=1)
+        return self._warnings.diverged(self._batch.warning[..., 1])
 
     def close(self) -> None:
         """See `Simulation`; there is nothing to give back."""

@@ -1,6 +1,7 @@
 """Entry point of the registered environment on hardware: arguments of `gymnasium.make` become a task on a plant."""
 
 import inspect
+from functools import partial
 from typing import Any
 
 from gymnasium.vector import AutoresetMode
@@ -48,7 +49,7 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
 def make_hardware_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Entry point; arguments as in `configure_hardware`."""
     task = configure_hardware(**arguments)
-    return ElasticEnv(task, render_mode, lambda: TestbedPicture(task.config.pendulum), task.plant)
+    return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
 
 
 def make_hardware_testbed_vector(
