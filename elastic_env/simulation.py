@@ -68,7 +68,11 @@ DIVERGED_RAD_S = 1e3
 """Speed of a joint beyond anything physical [rad/s]: two hundred times the no-load speed of the servos."""
 
 _BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
-_FULL = [int(getattr(mujoco.mjtWarning, f"mjWARN_{what}FULL")) for what in ("CONTACT", "CNSTR")]
+_OTHERS = {
+    int(mujoco.mjtWarning.mjWARN_INERTIA): "a nearly singular inertia matrix: look at the inertias of its bodies",
+    int(mujoco.mjtWarning.mjWARN_CONTACTFULL): 'too many contacts for its memory: enlarge <size memory="..."/>',
+    int(mujoco.mjtWarning.mjWARN_CNSTRFULL): 'too many constraints for its memory: enlarge <size memory="..."/>',
+}
 
 
 class _Warnings:
@@ -82,16 +86,10 @@ class _Warnings:
         if not counts.any():
             return np.zeros(len(counts), dtype=np.bool_)
         for kind in np.flatnonzero(counts.any(axis=0)).tolist():
-            if kind not in _BAD and kind not in self._said:
+            if kind in _OTHERS and kind not in self._said:
                 self._said.add(kind)
-                warnings.warn(_explain(kind), RuntimeWarning, stacklevel=2)
-        return counts[:, _BAD].any(axis=1)
-
-
-def _explain(kind: int) -> str:
-    """A warning of MuJoCo, and what to change."""
-    cure = 'give the model a larger arena: <size memory="..."/>' if kind in _FULL else "look at the model's inertias"
-    return f"MuJoCo warns: {mujoco.mju_warningText(kind, 0)}. The simulation goes on, less exact; {cure}"
+                warnings.warn(f"MuJoCo goes on, less exact; the model has {_OTHERS[kind]}", stacklevel=2)
+        return np.asarray(counts[:, _BAD].any(axis=1))
 
 
 class SingleWorld:

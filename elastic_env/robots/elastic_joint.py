@@ -12,6 +12,7 @@ Three forms of the same joint:
 Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
 """
 
+import warnings
 from collections.abc import Mapping
 from typing import Literal, get_args
 
@@ -22,6 +23,7 @@ from elastic_env.elasticity import ElasticJoint, Servo
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.joint_names import link_name, motor_name, servo_name, spring_name
 from elastic_env.robots.keyframes import give_keyframes, take_keyframes
+from elastic_env.robots.time_step import is_stable, largest_stable_timestep
 from elastic_env.signals import Array
 
 Form = Literal["tendon", "series", "rigid"]
@@ -60,7 +62,20 @@ def make_elastic(
     Raises:
         ConfigurationError: Unknown form or hinge, a joint that is no hinge, a name that is already taken, or
             parameters that the series form cannot represent.
+
+    Warns:
+        UserWarning: The model's integrator and physics step do not follow the elastic joints, or a servo is left out
+            because the hinge keeps its actuators.
     """
+    elastic = transformed(spec, joints, form, actuators)
+    _warn_of_explosion(elastic)
+    return elastic
+
+
+def transformed(
+    spec: mujoco.MjSpec, joints: Mapping[str, ElasticJoint], form: Form = "tendon", actuators: ActuatorRule = "keep"
+) -> mujoco.MjSpec:
+    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at their stability then."""
     if form not in get_args(Form):
         raise unknown_name("form", form, get_args(Form))
     if actuators not in get_args(ActuatorRule):
@@ -72,6 +87,24 @@ def make_elastic(
         _transform(elastic, _hinge(elastic, name), joint, form, actuators)
     give_keyframes(elastic, keyframes, list(joints))
     return elastic
+
+
+def _warn_of_explosion(spec: mujoco.MjSpec) -> None:
+    """Say so where the model's integrator does not follow its elastic joints: MuJoCo would start it anew silently."""
+    model = spec.compile()
+    if is_stable(model):
+        return
+    own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    cure = f"take a physics step of at most {largest_stable_timestep(model) / 1.1:.2g} s with it"
+    if is_stable(model):
+        cure = "that follows them"
+    warnings.warn(
+        f"the elastic joints explode with the integrator {own} at a physics step of {model.opt.timestep:g} s, after "
+        "which MuJoCo starts a model anew without a word; set spec.option.integrator to "
+        f"mujoco.mjtIntegrator.mjINT_IMPLICITFAST, {cure}",
+        stacklevel=3,
+    )
 
 
 def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
@@ -236,6 +269,13 @@ def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rul
             actuator.target = driven
     if servo is not None and (rule == "replace" or not existing):
         _add_servo(spec, servo_name(name), driven, servo)
+    elif servo is not None:
+        kept = ", ".join(repr(actuator.name) for actuator in existing)
+        warnings.warn(
+            f"the hinge {name!r} keeps its actuator {kept}, so that its servo is left out; choose actuators='replace' "
+            "for the servo in its place, or give the joint servo=None",
+            stacklevel=4,
+        )
 
 
 def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:

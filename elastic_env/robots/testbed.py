@@ -11,7 +11,7 @@ import numpy as np
 
 from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint
-from elastic_env.robots.elastic_joint import Form, make_elastic
+from elastic_env.robots.elastic_joint import Form, transformed
 from elastic_env.signals import Array
 
 JOINT = "joint"
@@ -83,6 +83,6 @@ def elastic_spec(
     gravity: float = GRAVITY_M_S2,
 ) -> mujoco.MjSpec:
     """The testbed with its elastic joint and servo, integrated by RK4."""
-    spec = make_elastic(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
+    spec = transformed(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
     spec.option.timestep = timestep_s
     return spec

@@ -24,7 +24,7 @@ import numpy as np
 from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint
 from elastic_env.robots.dynamixel import H54_200_S500_R
-from elastic_env.robots.elastic_joint import Form, make_elastic
+from elastic_env.robots.elastic_joint import Form, transformed
 from elastic_env.signals import Array
 from elastic_env.walking.biped import Biped
 from elastic_env.walking.leg_kinematics import JOINTS, LegGeometry
@@ -139,7 +139,7 @@ def elastic_spec(
         form: "tendon", or "rigid" for what an inelastic robot would do.
         timestep_s: Physics step [s].
     """
-    spec = make_elastic(rigid_spec(robot), joints, form, actuators="replace")
+    spec = transformed(rigid_spec(robot), joints, form, actuators="replace")
     spec.option.timestep = timestep_s
     for side in SIDES:
         for kind, name in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):

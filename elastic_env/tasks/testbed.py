@@ -45,10 +45,11 @@ from elastic_env.plan import PlanTable
 from elastic_env.robots.joint_names import JointAddresses
 from elastic_env.robots.robot_model import RobotModel
 from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec
+from elastic_env.robots.time_step import require_stable
 from elastic_env.rows import Rows
 from elastic_env.sensors import NoiseStream, attitude, is_due, quantise
 from elastic_env.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
-from elastic_env.simulation import Simulation, substeps
+from elastic_env.simulation import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.tasks.task import Outcome
 from elastic_env.tasks.testbed_config import TestbedConfig, require_feasible
 
@@ -174,6 +175,7 @@ class TestbedTask:
         self._joint, self._pendulum = config.true_joint, config.true_pendulum
         self._true_model = config.robot_model(self._joint, self._pendulum, self.observation_table)
         self.model = elastic_spec(self._pendulum, self._joint, config.form, config.timestep_s).compile()
+        require_stable(self.model, config.control_period_s)
         self._at = JointAddresses.of(self.model, [JOINT])
         self._noise = NoiseStream(num_worlds, NOISE)
         self._reference = PlanTable(config.reference, config.control_period_s, num_worlds)
@@ -219,6 +221,7 @@ class TestbedTask:
 
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
         """Read the new state, then what the sensors show of it; score it."""
+        diverged = diverged | (np.abs(simulation.qvel) > DIVERGED_RAD_S).any(axis=1)
         self._step, self._diverged = self._step + 1, diverged
         self._read(simulation, ~diverged)
         before, self._measured = self._measured, self._measure(~diverged)

@@ -8,9 +8,11 @@ import numpy as np
 
 from elastic_env.config import Model, quantity
 from elastic_env.elasticity import ElasticJoint
+from elastic_env.robots.elastic_joint import Form
 from elastic_env.robots.joint_names import spring_name
 from elastic_env.robots.standing import Equilibrium, settle
 from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped, elastic_spec
+from elastic_env.robots.time_step import require_stable
 from elastic_env.scenario import Scenario, make_scenario
 from elastic_env.signals import Array, IntArray
 from elastic_env.walking.gait import Gait
@@ -93,6 +95,15 @@ class RobotDraw(Model):
 
 BANK_SIZE = 64
 """Robots in the bank of a scenario that draws them."""
+
+
+@lru_cache(maxsize=64)
+def require_stable_walker(
+    robot: Thormang, joints: tuple[ElasticJoint, ...], form: Form, timestep_s: float, control_period_s: float
+) -> None:
+    """Refuse joints that explode with the physics step, see `elastic_env.robots.time_step`; looked at once."""
+    spec = elastic_spec(robot, dict(zip(LEG_JOINTS, joints, strict=True)), form, timestep_s)
+    require_stable(spec.compile(), control_period_s)
 
 
 @lru_cache(maxsize=512)

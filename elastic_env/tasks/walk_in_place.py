@@ -67,7 +67,7 @@ from elastic_env.robots.thormang import LEG_JOINTS, SIDES, biped
 from elastic_env.scenario import Scenario
 from elastic_env.sensors import NoiseStream, angle_of_count, is_due
 from elastic_env.signals import Array, BoolArray, IntArray, Signals
-from elastic_env.simulation import Simulation, substeps
+from elastic_env.simulation import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.tasks.task import Outcome
 from elastic_env.tasks.walk_config import (
     FALL_HEIGHT_SHARE,
@@ -75,6 +75,7 @@ from elastic_env.tasks.walk_config import (
     WalkConfig,
     equilibrium,
     floor_tilt,
+    require_stable_walker,
     robot_bank,
     spring_ids,
 )
@@ -127,6 +128,13 @@ class WalkTask:
         )
         require_feasible(self.plan, robot, model.servos)
         self._true_model = _true_model(config, self.plan)
+        require_stable_walker(
+            config.true_robot,  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+            tuple(config.true_joints.values()),  # pyright: ignore[reportArgumentType]
+            config.form,
+            config.timestep_s,
+            config.control_period_s,
+        )
         self.model = config.true_model()
         self._bank = robot_bank(config.scenario, config.bank)
         self._springs = spring_ids(self.model) if config.form == "tendon" else None
@@ -389,6 +397,7 @@ def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
         RULES, control_period_s=config.control_period_s, is_delayed=config.scenario.delay_steps > 0,
         loaded_n=loaded_n, zmp_n=zmp_n, weights=weights,
         lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m, highest_tilt_rad=FALL_TILT_RAD,
+        highest_rad_s=DIVERGED_RAD_S,
     )  # fmt: skip
 
 

@@ -85,6 +85,7 @@ QUALITY = record_type(
 RULES = record_type(
     ("control_period_s", REAL), ("is_delayed", np.bool_),  # whether measurements are shown a step late
     ("lowest_pelvis_m", REAL), ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
+    ("highest_rad_s", REAL),  # beyond it the simulation has diverged
     ("loaded_n", REAL),  # vertical force of a loaded foot
     ("zmp_n", REAL),  # least vertical force for a ZMP
     ("weights", SCORES),

@@ -250,8 +250,12 @@ def shown_angle(angle: float, drawn_bias: float, noise: float, quality: Any) -> 
 
 @compiled
 def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray) -> bool:
-    """Say what ends the episode of a world, if anything does."""
-    has_fallen = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
+    """Say what ends the episode of a world, if anything does; speeds beyond all physics are no fall."""
+    for i in range(len(row.theta_dot)):
+        fastest = max(abs(row.theta_dot[i]), abs(row.q_dot[i]))
+        has_diverged = has_diverged or fastest > rules.highest_rad_s
+    is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
+    has_fallen = is_down and not has_diverged
     is_terminated = has_diverged or has_fallen
     ends[0], ends[1], ends[2], ends[3] = has_diverged, has_fallen, is_terminated, is_last and not is_terminated
     return is_terminated or is_last
