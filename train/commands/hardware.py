@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -28,12 +28,12 @@ class Scan:
         from train.hardware import scan
 
         if not scan(self.port, self.baudrate, CONSOLE):
-            sys.exit(1)
+            sys.exit(3)
 
 
 @dataclass
 class Check:
-    """Look at port, servos and IMU before anything moves, and say what to do; exit code 1 if there is anything to do.
+    """Look at port, servos and IMU before anything moves, and say what to do; exit code 3 if there is anything to do.
 
     Example: elastic hardware check /dev/ttyUSB0 --ids 1 --imu-port /dev/ttyACM0
     """
@@ -54,7 +54,7 @@ class Check:
         from train.hardware import check
 
         if not check(self.port, self.ids, self.baudrate, self.imu_port, self.imu_baudrate, CONSOLE):
-            sys.exit(1)
+            sys.exit(3)
 
 
 @dataclass
@@ -113,6 +113,10 @@ class Emulate:
     """Share of replies that end too early."""
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
+    imu_shows: Literal["truth", "nan", "infinite", "out of range", "frozen"] = "truth"
+    """What the IMU shows, always marked as valid."""
+    hot: bool = False
+    """The servos have 95 °C, and raise no alert."""
     seed: int = 0
     """Seed of noise and faults."""
 
@@ -125,7 +129,7 @@ class Emulate:
 
         faults = Faults(
             unheard=self.unheard, lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
-            latency_s=1e-3 * self.latency_ms,
+            latency_s=1e-3 * self.latency_ms, imu_shows=self.imu_shows, hot=self.hot,
         )  # fmt: skip
         config = EmulatorConfig(
             ids=tuple(self.ids), model_number=self.model_number, baudrate=self.baudrate, faults=faults, seed=self.seed,
@@ -138,7 +142,7 @@ class Emulate:
 class Prove:
     """Measure what driver, limits and supervisor do when things go wrong, against an emulated bus.
 
-    Long: about half an hour; --share 0.02 makes a short one. Exit code 1 if something is not as it must be.
+    Long: about half an hour; --share 0.02 makes a short one. Exit code 3 if something is not as it must be.
     """
 
     share: float = 1.0
@@ -153,7 +157,7 @@ class Prove:
         from train.prove_hardware import prove
 
         if not prove(self.share, self.only, CONSOLE, self.output):
-            sys.exit(1)
+            sys.exit(3)
 
 
 @dataclass
