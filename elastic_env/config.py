@@ -5,6 +5,7 @@ value raises an error that names the field, the unit, the bound and what was giv
 lists the keys that exist.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,16 +68,22 @@ class Model(BaseModel):
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
 
 
-def _is_name(value: str) -> str:
-    if not value.isprintable() or not 1 <= len(value) <= LONGEST_NAME:
-        raise ValueError(f"must be 1 to {LONGEST_NAME} printable characters, got {shown(value)}")
+def _is_text(value: str) -> str:
+    if _NO_TEXT.search(value):
+        raise ValueError(f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}")
     return value
 
 
-LONGEST_NAME = 1000
-"""Characters of a name, which may be a path."""
-Name = Annotated[str, AfterValidator(_is_name)]
-"""Text that names something: a policy, a scenario, a label."""
+_NO_TEXT = re.compile("[\x00\ud800-\udfff]")
+_Text = Annotated[str, AfterValidator(_is_text)]
+Title = Annotated[_Text, Field(max_length=100)]
+"""Text that names something in tables and files."""
+Locator = Annotated[_Text, Field(max_length=1000)]
+"""Text that may hold a path."""
+MOST_ENTRIES = 1000
+"""Entries of a list in a configuration."""
+LARGEST_SEED = 2**63 - 1
+"""Seeds of episodes are 64-bit integers."""
 
 
 def plain_numbers(value: Any) -> Any:

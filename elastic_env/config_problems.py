@@ -110,6 +110,8 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
         case "too_long":
             most = problem["ctx"]["max_length"]
             return Problem(path, "must", f"must have at most {most} {_entries(most)}, got {given}")
+        case "string_too_long":
+            return Problem(path, "must", f"must have at most {problem['ctx']['max_length']} characters, got {given}")
         case "string_pattern_mismatch":
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")

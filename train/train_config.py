@@ -8,9 +8,9 @@ from pydantic import Field, field_validator, model_validator
 import baselines
 from baselines.correction import ResidualSettings
 from baselines.residual import ResidualDescription, require_plain_base
-from elastic_env.config import Model, quantity
+from elastic_env.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.errors import ConfigurationError
-from train.conditions import Condition, Motion, PolicySpec
+from train.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
 from train.environments import environment
 from train.mixed_env import mixed_env
 from train.residual_env import ResidualVectorWrapper
@@ -23,39 +23,44 @@ TRAINING_SEED_STRIDE = 100_000
 """Distance of the episodes of two training seeds."""
 
 
+_MOST_DECISIONS = 10**12
+
+
 class TrainConfig(Model):
     """What is trained on what."""
 
-    name: str = "train"
+    name: Title = "train"
     env: str = "walker"
     reference: Motion | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    scenarios: list[str] = Field(default=["nominal"], min_length=1)
+    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
     """Scenarios whose worlds are learned from together, in equal shares."""
     weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = {}
     """How much the rewards of single scenarios count; 1 where nothing is said."""
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
-    base: str = "input_output"
+    base: Title = "input_output"
     """Policy that is corrected: a baseline by name, since an exported residual plays without code of its own."""
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
     """How the residual acts and what it sees."""
-    algorithm: str = "PPO"
+    algorithm: Locator = "PPO"
     """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a search over
     residuals that never change."""
     algorithm_options: dict[str, Any] = {}
     """Its keyword arguments, over the defaults."""
     anneal: bool = False
     """Whether the learning rate falls linearly to zero over the decisions."""
-    clip: float = quantity("1", 10.0, gt=0, description="bound of normalised features, in standard deviations")
-    worlds: int = quantity("1", 64, ge=2, description="worlds, shared out to the scenarios")
-    decisions: int = quantity("1", 200_000, ge=1, description="decisions of all worlds together")
-    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1)
+    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
+    worlds: int = quantity("1", 64, ge=2, le=10_000_000, description="worlds, shared out to the scenarios")
+    decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS, description="decisions of all worlds together")
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1, max_length=MOST_ENTRIES)
     """Training seeds, each a run of its own."""
-    evaluate_every: int = quantity("1", 20_000, ge=1, description="decisions between evaluations")
-    evaluation_episodes: int = quantity("1", 4, ge=1, description="episodes per scenario in an evaluation")
-    checkpoint_every: int = quantity("1", 10_000, ge=1, description="decisions between checkpoints")
+    evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS, description="decisions between evaluations")
+    evaluation_episodes: int = quantity(
+        "1", 4, ge=1, le=MOST_EPISODES, description="episodes per scenario in an evaluation"
+    )
+    checkpoint_every: int = quantity("1", 10_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
 
     _checked = field_validator("base")(require_plain_base)
 
