@@ -5,7 +5,6 @@ value raises an error that names the field, the unit, the bound and what was giv
 lists the keys that exist.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from elastic_env.config_problems import ModelError, problems_of
 from elastic_env.errors import ConfigurationError, shown
-from elastic_env.yaml_text import LARGEST_TEXT, parse_yaml
+from elastic_env.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 
 ModelT = TypeVar("ModelT", bound="Model")
 
@@ -69,12 +68,11 @@ class Model(BaseModel):
 
 
 def _is_text(value: str) -> str:
-    if _NO_TEXT.search(value):
+    if NO_TEXT.search(value):
         raise ValueError(f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}")
     return value
 
 
-_NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 _Text = Annotated[str, AfterValidator(_is_text)]
 Title = Annotated[_Text, Field(max_length=100)]
 """Text that names something in tables and files."""

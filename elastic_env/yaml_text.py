@@ -19,7 +19,8 @@ LONGEST_NUMBER = 40
 
 _TAG = "tag:yaml.org,2002:"
 _EXPONENT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-_NO_TEXT = re.compile("[\x00\ud800-\udfff]")
+NO_TEXT = re.compile("[\x00\ud800-\udfff]")
+"""Characters that stand in no name and no file: zero bytes and halves of characters."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -93,7 +94,7 @@ def _require_plain(event: Any) -> None:
     """Refuse tags, and text that no file can hold."""
     if event.tag not in (None, "!", f"{_TAG}str"):
         raise _refusal(event, f"the tag {event.tag.replace(_TAG, '!!')[:100]!r} has no meaning here; leave it out")
-    if isinstance(event, yaml.ScalarEvent) and _NO_TEXT.search(event.value):
+    if isinstance(event, yaml.ScalarEvent) and NO_TEXT.search(event.value):
         raise _refusal(event, "text must hold neither zero bytes nor halves of characters")
 
 

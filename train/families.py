@@ -95,16 +95,16 @@ def is_residual(policy: PolicySpec) -> bool:
 def origin(members: Sequence[Member]) -> Origin:
     """How a family was trained, from its files."""
     descriptions = [read_description(Path(member.folder)) for member in members]
-    config = descriptions[0].training.get("config", {})
-    scenarios = config.get("scenarios")
-    wanted, had = set(config.get("seeds", ())), {member.training_seed for member in members}
+    config = descriptions[0].origin.config
+    scenarios = config.scenarios
+    wanted, had = set(config.seeds), {member.training_seed for member in members}
     return Origin(
         scenarios=None if scenarios is None else tuple(scenarios),
         environment=descriptions[0].robot,
-        reference=config.get("reference"),
+        reference=config.reference,
         missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
         folders=tuple(member.folder for member in members),
-        commits=tuple(dict.fromkeys(str(d.training.get("commit") or "unknown") for d in descriptions)),
+        commits=tuple(dict.fromkeys(d.origin.commit or "unknown" for d in descriptions)),
     )
 
 
@@ -139,9 +139,8 @@ def _nearest(pattern: Path) -> str:
 
 def _training_seed(folder: Path, description: ResidualDescription) -> int | None:
     """As the residual says it, or the name of its folder; None where neither does."""
-    seed = description.training.get("seed")
-    if isinstance(seed, int) and not isinstance(seed, bool):
-        return seed
+    if description.origin.seed is not None:
+        return description.origin.seed
     found = _SEED.findall(str(folder))
     return int(found[-1]) if found else None
 
