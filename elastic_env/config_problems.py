@@ -46,6 +46,9 @@ class Problem:
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
 
 
+_MOST_SAID = 20
+
+
 def dotted(path: ParameterPath) -> str:
     """A parameter as the keys that lead to it."""
     return ".".join(part if isinstance(part, str) and len(part) < 100 else shown(part) for part in path)
@@ -69,7 +72,9 @@ class ModelError(ConfigurationError):
 
     def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
         """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
-        return "\n".join(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
+        sentences = list(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
+        more = [f"and {len(sentences) - _MOST_SAID} more"] if len(sentences) > _MOST_SAID else []
+        return "\n".join([*sentences[:_MOST_SAID], *more])
 
 
 def problems_of(model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]) -> list[Problem]:

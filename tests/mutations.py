@@ -3,6 +3,7 @@
 python -m tests.mutations FIRST COUNT     plays cases in this process and prints what was neither taken nor refused
 """
 
+import copy
 import json
 import random
 import resource
@@ -36,9 +37,14 @@ NASTY: list[Any] = [
     float("nan"), float("inf"), -float("inf"), "", " ", "x", "x" * 300, "../../x", "/", "a/b", "nul\x00byte", "\ud800",
     "ärger€", "🙂", "2001-99-99", "2001-01-01", "1e3", "json:loads", "no_such:f", ":", "os:sep", "*", "[", "residual:",
     "residual:*", "residual:/", "residual:x", "-", "+", "ideal+ideal", "soft+soft", "hold", "walker", "testbed", [], {},
-    [[]], [None], [0], [-1.5, 2], ["x"], [1, 2, 3], [0.5, 0.5, 0.5], {"x": 1}, {"kind": "sine"}, {"kind": "hold", "positions": 900},
+    [[]], [None], [0], [-1.5, 2], ["x"], [1, 2, 3], [0.5, 0.5, 0.5], {"x": 1}, {"kind": "sine"},
+    {"kind": "hold", "positions": 900},
     {"kind": "steps", "moves": 1000}, {"step_period": 3, "num_steps": 10**6}, {"name": "x"}, {"": 0}, [[1, 2], [3]],
     [1] * 2000, {str(i): i for i in range(2000)}, "a\nb", "\u202e",
+]  # fmt: skip
+ADDED = [
+    b"\x00", b"[" * 5000, b"{a: " * 3000, b"&a [*a]", b"!!timestamp x", b"9" * 5000, b"\xff", b"? ", b"- ", b"*a",
+    b"<<: ", b"'", b"\t", b": ", b"1: 2\n", b"x: !!binary aGk=",
 ]  # fmt: skip
 KEYS = [
     "name", "env", "references", "reference", "scenarios", "policies", "options", "env_options", "joint", "stiffness",
@@ -70,7 +76,7 @@ def _at(tree: Any, path: tuple[Any, ...]) -> Any:
 def change(tree: Any, draw: random.Random) -> Any:
     """A tree with one mistake; it is changed in place."""
     known = places(tree)
-    value = draw.choice([*NASTY, _nested(20), _nested(200)])
+    value = copy.deepcopy(draw.choice([*NASTY, _nested(20), _nested(200)]))
     if not known or draw.random() < 0.02:
         return value
     *where, key = draw.choice(known)
@@ -96,20 +102,7 @@ def damage(data: bytes, draw: random.Random) -> bytes:
         case 0:
             return data[:place]
         case 1:
-            added = [
-                b"\x00",
-                b"[" * 5000,
-                b"{a: " * 3000,
-                b"&a [*a]",
-                b"!!timestamp x",
-                b"9" * 5000,
-                b"\xff",
-                b"? ",
-                b"- ",
-            ]
-            return data[:place] + draw.choice(
-                [*added, b"*a", b"<<: ", b"'", b"\t", b": ", b"1: 2\n", b"x: !!binary aGk="]
-            )
+            return data[:place] + draw.choice(ADDED)
         case 2:
             return data + data
         case 3:
@@ -183,6 +176,9 @@ def read_residual(folder: Path) -> None:
     try_out(config.conditions())
 
 
+LONGEST_S = 10.0
+"""A case that takes longer is a fault."""
+
 READERS: dict[str, Callable[[Path], None]] = {"train": read_training, "bench": read_bench, "": read_comparison}
 """What reads the shipped configurations, by the beginning of their names."""
 
@@ -220,10 +216,13 @@ def main(first: int, count: int) -> int:
             except Exception:
                 faults += 1
                 print(f"case {number}:\n{''.join(traceback.format_exc().splitlines(keepends=True)[-9:])}", flush=True)
+            if time.monotonic() - began > LONGEST_S:
+                faults += 1
+                print(f"case {number}: {time.monotonic() - began:.1f} s", flush=True)
             slowest = max(slowest, (time.monotonic() - began, number))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{count} cases: {faults} faults, {taken} taken, {count - taken - faults} refused; slowest {slowest[0]:.1f} s "
-          f"(case {slowest[1]}), peak {peak:.0f} MB, longest error {longest} characters")  # fmt: skip
+    print(f"{count} cases: {faults} faults, {taken} taken; slowest {slowest[0]:.1f} s (case {slowest[1]})")
+    print(f"peak {peak:.0f} MB, longest error {longest} characters")
     return faults
 
 

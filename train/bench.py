@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -17,6 +17,7 @@ from elastic_env.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import environment
 from train.evaluate import Evaluation
+from train.kinds import is_a
 from train.runs import run_folder
 from train.workers import run_conditions
 
@@ -54,6 +55,7 @@ class BenchConfig(Model):
     margin: float = quantity(
         "1", 0.05, ge=0, le=100, description="relative amount by which a figure may exceed the accepted"
     )
+    _kind = model_validator(mode="before")(is_a("bench"))
     cases: list[BenchCase] = Field(min_length=1, max_length=MOST_ENTRIES)
 
 

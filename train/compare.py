@@ -18,6 +18,7 @@ from train.environments import Environment, Reference, environment
 from train.evaluate import Evaluation, make_policy, with_one_world
 from train.families import expand
 from train.figures import draw_figures
+from train.kinds import is_a
 from train.report import Results, require_plotly, write_report
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
@@ -68,6 +69,8 @@ class CompareConfig(Model):
     def _environment_has_a_default(cls, values: Any) -> Any:
         name = values.get("env", "testbed") if isinstance(values, dict) else None
         return {"references": [environment(name).default_reference], **values} if isinstance(name, str) else values
+
+    _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
 
     @field_validator("policies", mode="before")
     @classmethod

@@ -1,5 +1,6 @@
 """What is trained on what: the configuration of a training, and the worlds that it learns from."""
 
+import os
 from typing import Annotated, Any, Self
 
 from gymnasium.vector import AutoresetMode
@@ -9,9 +10,10 @@ import baselines
 from baselines.correction import ResidualSettings
 from baselines.residual import ResidualDescription, require_plain_base
 from elastic_env.config import MOST_ENTRIES, Locator, Model, Title, quantity
-from elastic_env.errors import ConfigurationError
+from elastic_env.errors import ConfigurationError, shown
 from train.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
 from train.environments import environment
+from train.kinds import is_a
 from train.mixed_env import mixed_env
 from train.residual_env import ResidualVectorWrapper
 
@@ -62,6 +64,7 @@ class TrainConfig(Model):
     )
     checkpoint_every: int = quantity("1", 10_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
 
+    _kind = model_validator(mode="before")(is_a("training"))
     _checked = field_validator("base")(require_plain_base)
 
     @model_validator(mode="after")
@@ -70,6 +73,13 @@ class TrainConfig(Model):
             if name not in self.scenarios:
                 raise ValueError(f"weights must be of scenarios that are learned from, {self.scenarios}, got {name!r}")
         return self
+
+    @field_validator("algorithm_options")
+    @classmethod
+    def _policy_arguments_are_a_mapping(cls, options: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(options.get("policy_kwargs"), dict | None):
+            raise ValueError(f"policy_kwargs must be a mapping, got {shown(options['policy_kwargs'])}")
+        return options
 
     @field_validator("seeds")
     @classmethod
@@ -121,6 +131,19 @@ class TrainConfig(Model):
         return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
 
 
+_WORLD_BYTES = 100_000
+"""Memory of a world: measured on the walker with its policy, and on the testbed with a motion of its own."""
+
+
+def _require_memory(worlds: int) -> None:
+    needed, there = worlds * _WORLD_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ConfigurationError(
+            f"{worlds} worlds take about {needed / 1e9:.1f} GB of memory, this computer has {there / 1e9:.1f} GB; "
+            f"set worlds to at most {there // _WORLD_BYTES}"
+        )
+
+
 def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> ResidualVectorWrapper:
     """Worlds under residuals of the configuration's base.
 
@@ -132,6 +155,7 @@ def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads:
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
+    _require_memory(sum(count for _, count in shares))
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
     apart = {**environment(config.env).learned_from, **config.env_options}
     worlds = mixed_env(
