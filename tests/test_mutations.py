@@ -16,6 +16,7 @@ from baselines.residual import load_residual, read_description
 from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError, shown
 from elastic_env.json_text import parse_json
+from elastic_env.simulation import substeps
 from tests.mutations import RESIDUALS
 from train.bench import BenchConfig
 from train.compare import CompareConfig
@@ -129,6 +130,13 @@ def test_worlds_beyond_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("os.sysconf", lambda name: 4096 if name == "SC_PAGE_SIZE" else 10**6)
     with pytest.raises(ConfigurationError, match=r"100000 worlds take about 10\.0 GB.* has 4\.1 GB; .*at most 40960"):
         training_worlds(TrainConfig(worlds=100_000), [("nominal", 100_000)], 1)
+
+
+@pytest.mark.parametrize("timestep_s", [1e-310, 1e-300, 1e-9])
+def test_a_physics_step_that_never_ends_a_control_period_is_refused(timestep_s: float) -> None:
+    """Catches an OverflowError, and a loop of 10⁶ steps of physics in each of control."""
+    with pytest.raises(ConfigurationError, match="timestep_s must be at least 4e-06 s"):
+        substeps(0.004, timestep_s)
 
 
 @pytest.mark.parametrize("name", ["json:loads", "os:getpid", "no_such_module:f", "json:no_such", "os:sep", "a\\b:c"])
