@@ -22,6 +22,7 @@ from train.bench import BenchConfig
 from train.compare import CompareConfig
 from train.conditions import PolicySpec
 from train.evaluate import make_policy
+from train.families import expand
 from train.kinds import TELLING
 from train.train_config import TrainConfig, training_worlds
 
@@ -101,6 +102,16 @@ def test_descriptions_that_nobody_can_use_are_refused(
     (folder / "residual.json").write_text(json.dumps(content))
     with pytest.raises(ConfigurationError, match=rf"residual\.json describes no residual: .*{message}"):
         read_description(folder)
+
+
+def test_a_motion_of_training_that_no_report_can_name_is_refused_at_once(tmp_path: Path) -> None:
+    """Catches an error at the end of a comparison, when all is simulated."""
+    folder = Path(shutil.copytree(RESIDUALS[-1], tmp_path / "w"))
+    content = json.loads((folder / "residual.json").read_text())
+    content["training"]["config"]["reference"] = {"steps": 3}
+    (folder / "residual.json").write_text(json.dumps(content))
+    with pytest.raises(ConfigurationError, match=r"residual\.json: training\.config\.reference: .*'step_period'"):
+        expand([PolicySpec(name=f"residual:{folder}")])
 
 
 @pytest.mark.parametrize(

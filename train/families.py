@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from baselines.policies import RESIDUAL
-from baselines.residual import ResidualDescription, read_description, shipped
+from baselines.residual import DESCRIPTION, ResidualDescription, read_description, shipped
 from elastic_env.errors import ConfigurationError
 from train.conditions import Member, PolicySpec
+from train.environments import ENVIRONMENTS
 
 _WILD = re.compile(r"[*?\[]")
 _NEAREST = 5
@@ -70,6 +71,8 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
             entrants.append(Entrant(policy))
             continue
         members = _members(policy.name.removeprefix(RESIDUAL))
+        for folder, _, said in members:
+            _require_motion(folder, said)
         description = members[0][2]
         base = next((known for known in bases if _plays(known, description, policy)), None)
         if base is None:
@@ -125,6 +128,17 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
         members.append((folder, _training_seed(folder, description), description))
     _require_one_family(pattern, members)
     return members
+
+
+def _require_motion(folder: Path, description: ResidualDescription) -> None:
+    """Refuse a residual whose training names a motion that its environment cannot read: the report would need it."""
+    known, reference = ENVIRONMENTS.get(description.robot), description.origin.config.reference
+    if known is None or reference is None:
+        return
+    try:
+        known.label(known.arguments(reference)[known.motion])
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{folder / DESCRIPTION}: training.config.reference: {error}") from None
 
 
 def _nearest(pattern: Path) -> str:
