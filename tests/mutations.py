@@ -76,7 +76,7 @@ def _at(tree: Any, path: tuple[Any, ...]) -> Any:
 def change(tree: Any, draw: random.Random) -> Any:
     """A tree with one mistake; it is changed in place."""
     known = places(tree)
-    value = copy.deepcopy(draw.choice([*NASTY, _nested(20), _nested(200)]))
+    value = copy.deepcopy(draw.choice([*NASTY, _nested(20), _nested(60)]))
     if not known or draw.random() < 0.02:
         return value
     *where, key = draw.choice(known)

@@ -104,7 +104,8 @@ class CompareConfig(Model):
         for name, scenarios in self.groups.items():
             if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
                 raise ConfigurationError(
-                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; got {scenarios}"
+                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; "
+                    f"got {shown(scenarios)}"
                 )
             for scenario in scenarios:
                 if scenario not in self.scenarios:
@@ -215,7 +216,7 @@ def compare(
 def _require_each_once(what: str, values: Sequence[object]) -> None:
     for value in values:
         if values.count(value) > 1:
-            raise ConfigurationError(f"the {what} {value!r} stands twice; its episodes would count double")
+            raise ConfigurationError(f"the {what} {shown(value)} stands twice; its episodes would count double")
 
 
 def try_out(conditions: Sequence[Condition]) -> None:

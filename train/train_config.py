@@ -71,7 +71,9 @@ class TrainConfig(Model):
     def _weights_are_of_scenarios(self) -> Self:
         for name in self.weights:
             if name not in self.scenarios:
-                raise ValueError(f"weights must be of scenarios that are learned from, {self.scenarios}, got {name!r}")
+                raise ValueError(
+                    f"weights must be of scenarios that are learned from, {shown(self.scenarios)}, got {shown(name)}"
+                )
         return self
 
     @field_validator("algorithm_options")
@@ -85,7 +87,7 @@ class TrainConfig(Model):
     @classmethod
     def _each_seed_once(cls, seeds: list[int]) -> list[int]:
         if len(set(seeds)) < len(seeds):
-            raise ValueError(f"every training seed has a folder of its own and can stand but once, got {seeds}")
+            raise ValueError(f"every training seed has a folder of its own and can stand but once, got {shown(seeds)}")
         return seeds
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import model_validator
 
 from elastic_env.config import Model, plain_numbers, quantity
-from elastic_env.errors import ConfigurationError
+from elastic_env.errors import ConfigurationError, shown
 from elastic_env.plan import STAND_S, control_times, minimum_jerk
 from elastic_env.signals import Array, BoolArray, IntArray
 
@@ -85,7 +85,7 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
         known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
         raise ConfigurationError(
             f"step_period must be one of {known} [s], or the three durations of double, single and double support [s] "
-            f"such as [0.8, 0.6, 0.8]; got {step_period!r}"
+            f"such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
         )
     names = ("double_support_s", "single_support_s", "last_double_support_s")
     return Gait(**dict(zip(names, durations, strict=True)), **parameters)
