@@ -114,6 +114,13 @@ def test_a_motion_of_training_that_no_report_can_name_is_refused_at_once(tmp_pat
         expand([PolicySpec(name=f"residual:{folder}")])
 
 
+def test_a_residual_far_down_in_folders_needs_no_label(tmp_path: Path) -> None:
+    """Catches a bound of labels that a path exceeds, which is the label where none is given."""
+    deep = tmp_path / ("x" * 150)
+    shutil.copytree(RESIDUALS[0], deep)
+    assert expand([PolicySpec(name=f"residual:{deep}")])[-1].policy.title == f"residual:{deep}"
+
+
 @pytest.mark.parametrize(
     ("file", "model", "message"),
     [

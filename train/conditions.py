@@ -44,7 +44,7 @@ class PolicySpec(Model):
     """A policy of a comparison: a baseline's name, or "module:function" for one's own, with options."""
 
     name: Locator
-    label: Title | None = None
+    label: Locator | None = None
     """How tables and figures call it; None for its name."""
     options: dict[str, Any] = {}
     """Keyword arguments of `baselines.make`, or of one's own function."""
