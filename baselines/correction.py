@@ -9,19 +9,20 @@ of two spaces:
   encoder readings alike. Zero means that the model is right.
 """
 
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from baselines.policy import Action, ObservationView, Policy, resume
-from elastic_env.config import Model, quantity
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.config import MOST_ENTRIES, Model, Title, quantity
+from elastic_env.errors import ConfigurationError, shown, unknown_name
 from elastic_env.robots.robot_model import RobotModel, WalkerModel
 from elastic_env.signals import Array, BoolArray, IntArray
 
 Space = Literal["joint", "model"]
 
+_LARGEST_SCALE = 1e3
 _DEFAULT_SCALE = {"joint": 0.02, "model": 0.6}
 
 
@@ -33,9 +34,11 @@ class ResidualSettings(Model):
     scale: float | dict[str, float] | None = None
     """Correction at a residual of 1, in rad for `joint`, relative for `model`; one for all joints, or by the end of the
     joints' names, as in {ankle_roll: 0.02}; None for 0.02 rad or 0.6."""
-    decision_period: int = quantity("1", 25, ge=1, description="control steps between decisions")
-    cutoff_hz: float = quantity("Hz", 2.0, gt=0, description="cut-off of the first-order low-pass of the correction")
-    joints: tuple[str, ...] | None = None
+    decision_period: int = quantity("1", 25, ge=1, le=100_000, description="control steps between decisions")
+    cutoff_hz: float = quantity(
+        "Hz", 2.0, gt=0, le=1e6, description="cut-off of the first-order low-pass of the correction"
+    )
+    joints: Annotated[tuple[Title, ...], Field(min_length=1, max_length=MOST_ENTRIES)] | None = None
     """Joints that are corrected, by the end of their names (ankle_roll means both); None for all."""
     shared: bool = False
     """Whether left and right joints of the same name share their residual: there are half as many to explore, and one
@@ -46,16 +49,16 @@ class ResidualSettings(Model):
     cautious: bool = False
     """Whether it is played only as far as there is `evidence` that the model is wrong (`baselines.evidence`), and else
     leaves the base alone. In training, under the wrappers of `train`, it acts freely. For a walker."""
-    observe: tuple[str, ...] = Field(default=("observation",), min_length=1)
+    observe: tuple[Title, ...] = Field(default=("observation",), min_length=1, max_length=MOST_ENTRIES)
     """What it sees: groups of the observation such as (clock, load_share), or all of it, and what
     `baselines.features` makes of it and of the plan."""
-    history: int = quantity("1", 0, ge=0, description="earlier decisions whose measurements it sees as well")
+    history: int = quantity("1", 0, ge=0, le=1000, description="earlier decisions whose measurements it sees as well")
 
     @model_validator(mode="after")
     def _scales_are_positive(self) -> Self:
         scales = self.scale.values() if isinstance(self.scale, dict) else [1.0 if self.scale is None else self.scale]
-        if not all(0.0 < scale < np.inf for scale in scales):
-            raise ValueError(f"scale must be positive, got {self.scale}")
+        if not all(0.0 < scale <= _LARGEST_SCALE for scale in scales):
+            raise ValueError(f"scale must be positive and at most {_LARGEST_SCALE:g}, got {shown(self.scale)}")
         return self
 
     @model_validator(mode="after")

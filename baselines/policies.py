@@ -114,7 +114,7 @@ def policy_names() -> list[str]:
     return list(_ON_THE_WALKER | _ON_THE_TESTBED)
 
 
-def make(name: str, env: Any, **options: Any) -> Policy:
+def make(name: str, env: Any, /, **options: Any) -> Policy:
     """A named baseline for an environment.
 
     | name | on the testbed | on the walker |

@@ -4,22 +4,22 @@ A folder holds `residual.json` (base, settings, network, how it was trained) and
 no code from it and needs no torch. The observation is normalised in here; the base policy sees it as it is.
 """
 
-import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
-from pydantic import field_validator
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from pydantic import ConfigDict, Field, field_validator
+from safetensors.numpy import save_file
 
 from baselines.correction import Corrected, ResidualSettings
 from baselines.evidence import caution
 from baselines.features import Features
+from baselines.network import Network, Tensors, read_tensors
 from baselines.policy import Action, ObservationView, Policy, resume
-from elastic_env.config import Model
+from elastic_env.config import MOST_ENTRIES, Model, Title, quantity
+from elastic_env.config_problems import ModelError
 from elastic_env.errors import ConfigurationError
+from elastic_env.json_text import parse_json
 from elastic_env.signals import Array
 
 RESIDUAL = "residual:"
@@ -27,18 +27,33 @@ RESIDUAL = "residual:"
 DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
 _SHIPPED = Path(__file__).parent / "trained"
 
-_BLOCK = 32
-"""Rows that are multiplied at once: a larger product would be shared out to threads, which then wait busily for more
-work in the way of the physics."""
-_ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
+
+class TrainedOn(Model):
+    """What comparisons read of the configuration of a training."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[], max_length=MOST_ENTRIES)
+    scenarios: list[Title] | None = Field(default=None, max_length=MOST_ENTRIES)
+    reference: str | float | list[float] | dict[str, Any] | None = None
+
+
+class Origin(Model):
+    """What comparisons read of how a residual was trained; the rest of it is for people."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    config: TrainedOn = TrainedOn()
+    seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    commit: Title | None = None
 
 
 class ResidualDescription(Model):
     """What `residual.json` says of the weights beside it."""
 
-    robot: str
+    robot: Title
     """Task of the environment, walker or testbed."""
-    base: str
+    base: Title
     """Name of the base policy."""
     base_options: dict[str, Any] = {}
     settings: ResidualSettings = ResidualSettings()
@@ -46,8 +61,7 @@ class ResidualDescription(Model):
     """Between the layers."""
     output: Literal["clip", "tanh"] = "clip"
     """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
-    clip: float = 10.0
-    """Bound of normalised features, in standard deviations."""
+    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
     training: dict[str, Any] = {}
     """How it was trained: configuration, seed, versions, commit."""
 
@@ -55,6 +69,17 @@ class ResidualDescription(Model):
     @classmethod
     def _base_is_no_residual(cls, value: str) -> str:
         return require_plain_base(value)
+
+    @field_validator("training")
+    @classmethod
+    def _origin_is_readable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        Origin(**value)
+        return value
+
+    @property
+    def origin(self) -> Origin:
+        """How it was trained, as far as comparisons read it."""
+        return Origin(**self.training)
 
 
 def require_plain_base(name: str) -> str:
@@ -66,63 +91,6 @@ def require_plain_base(name: str) -> str:
     if name.startswith(RESIDUAL):
         raise ValueError(f"the base of a residual must be no residual itself, got {name!r}; name a baseline")
     return name
-
-
-class Network:
-    """Feed-forward network in single precision, as it was trained: the mean action of normalised features.
-
-    Rows of a batch agree with single rows to rounding only (10⁻⁶): a matrix product may add in another order.
-
-    Args:
-        description: Activation, output and clipping.
-        tensors: `mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ...
-
-    Raises:
-        ConfigurationError: Tensors that are missing, not finite, or do not fit one another.
-    """
-
-    def __init__(self, description: ResidualDescription, tensors: dict[str, npt.NDArray[Any]]) -> None:
-        depth = sum(name.startswith("weight") for name in tensors)
-        names = {"mean", "std", *(f"{kind}{i}" for i in range(depth) for kind in ("weight", "bias"))}
-        if depth == 0 or set(tensors) != names:
-            raise ConfigurationError(f"weights must be mean, std, weight0, bias0, ...; got {sorted(tensors)}")
-        self._mean, self._std = tensors["mean"].astype(np.float64), tensors["std"].astype(np.float64)
-        layers = [(tensors[f"weight{i}"], tensors[f"bias{i}"]) for i in range(depth)]
-        self._layers = [(W.astype(np.float32).T, b.astype(np.float32)) for W, b in layers]
-        widths = [len(self._mean), *(len(bias) for _, bias in layers)]
-        for (W, _), shape in zip(layers, zip(widths[1:], widths, strict=False), strict=True):
-            if W.shape != shape:
-                raise ConfigurationError(f"a layer must have the shape {shape}, got {W.shape}")
-        if self._std.shape != self._mean.shape or not (self._std > 0.0).all():
-            raise ConfigurationError("std must have one positive value per feature")
-        if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
-            raise ConfigurationError("weights must be finite")
-        self._activation, self._output = _ACTIVATIONS[description.activation], description.output
-        self._clip = description.clip
-
-    @property
-    def num_features(self) -> int:
-        """Width of the input."""
-        return len(self._mean)
-
-    @property
-    def num_outputs(self) -> int:
-        """Width of the output."""
-        return len(self._layers[-1][1])
-
-    def __call__(self, features: Array) -> Array:
-        """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
-        blocks = [self._forward(features[i : i + _BLOCK]) for i in range(0, len(features), _BLOCK)]
-        return np.concatenate(blocks) if blocks else np.zeros((0, self.num_outputs))
-
-    def _forward(self, features: Array) -> Array:
-        x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
-        for number, (W, b) in enumerate(self._layers):
-            x = x @ W + b
-            if number < len(self._layers) - 1:
-                x = self._activation(x)
-        x = np.tanh(x) if self._output == "tanh" else np.clip(x, -1.0, 1.0)
-        return x.astype(np.float64)
 
 
 class ResidualPolicy:
@@ -191,7 +159,7 @@ class ResidualPolicy:
 _UNDECIDED = -1.0
 
 
-def save_residual(folder: Path, description: ResidualDescription, tensors: dict[str, npt.NDArray[Any]]) -> None:
+def save_residual(folder: Path, description: ResidualDescription, tensors: Tensors) -> None:
     """Write a residual that `load_residual` reads; the network must be valid.
 
     Raises:
@@ -222,7 +190,7 @@ def read_description(folder: Path) -> ResidualDescription:
     """
     folder = located(folder)
     try:
-        content = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+        content = parse_json((folder / DESCRIPTION).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(
             f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({error.strerror}), or the "
@@ -234,8 +202,8 @@ def read_description(folder: Path) -> ResidualDescription:
         raise ConfigurationError(f"{folder / DESCRIPTION} must be a mapping, got {type(content).__name__}")
     try:
         return ResidualDescription(**content)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{folder / DESCRIPTION} describes no residual: {error}") from None
+    except ModelError as error:
+        raise ConfigurationError(f"{folder / DESCRIPTION} describes no residual: {error.named()}") from None
 
 
 def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
@@ -245,14 +213,11 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
         ConfigurationError: There is none, or it is damaged.
     """
     folder = located(folder)
-    description = read_description(folder)
+    description, tensors = read_description(folder), read_tensors(folder / WEIGHTS)
     try:
-        tensors = load_file(folder / WEIGHTS)
-    except (OSError, SafetensorError) as error:
-        raise ConfigurationError(
-            f"{folder / WEIGHTS} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
-        ) from None
-    return description, Network(description, tensors)
+        return description, Network(description, tensors)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{folder / WEIGHTS} holds no network: {error}") from None
 
 
 def residual_policy(folder: Path, base: Policy, model: Any) -> ResidualPolicy:

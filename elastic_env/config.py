@@ -5,7 +5,6 @@ value raises an error that names the field, the unit, the bound and what was giv
 lists the keys that exist.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,11 @@ from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.config_problems import ModelError, problems_of
+from elastic_env.errors import ConfigurationError, shown
+from elastic_env.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 
 ModelT = TypeVar("ModelT", bound="Model")
 
@@ -46,7 +47,7 @@ class Model(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ConfigurationError(_explain(type(self), error)) from None
+            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
 
     @model_validator(mode="before")
     @classmethod
@@ -64,6 +65,23 @@ class Model(BaseModel):
     def replace(self, **changes: Any) -> Self:
         """A validated copy with some parameters changed."""
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+
+
+def _is_text(value: str) -> str:
+    if NO_TEXT.search(value):
+        raise ValueError(f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}")
+    return value
+
+
+_Text = Annotated[str, AfterValidator(_is_text)]
+Title = Annotated[_Text, Field(max_length=100)]
+"""Text that names something in tables and files."""
+Locator = Annotated[_Text, Field(max_length=1000)]
+"""Text that may hold a path."""
+MOST_ENTRIES = 1000
+"""Entries of a list in a configuration."""
+LARGEST_SEED = 2**63 - 1
+"""Seeds of episodes are 64-bit integers."""
 
 
 def plain_numbers(value: Any) -> Any:
@@ -119,68 +137,6 @@ def _is_numeric(annotation: Any) -> bool:
     return bool(arguments) and all(map(_is_numeric, arguments))
 
 
-def _explain(model: type[BaseModel], error: ValidationError) -> str:
-    """All problems of a validation, one per line, each with name, unit, bound and value."""
-    return "\n".join(_explain_one(model, problem) for problem in error.errors())
-
-
-def _explain_one(model: type[BaseModel], problem: Mapping[str, Any]) -> str:
-    name = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        return str(unknown_name(f"parameter of {model.__name__}", name, model.model_fields))
-    if problem["type"] == "missing":
-        field = model.model_fields.get(name)
-        meaning = f": {field.description}" if field is not None and field.description else ""
-        return f"{model.__name__} needs the parameter {name!r}{_unit(model, name)}{meaning}"
-    if problem["type"] == "value_error":
-        message = str(problem["ctx"]["error"])
-        return f"{name}: {message}" if name else message
-    if problem["type"] == "model_type":
-        return f"{model.__name__}.{name} must be a mapping of parameters, got {problem['input']!r}"
-    if problem["type"] == "too_short":
-        return f"{model.__name__}.{name} needs at least {problem['ctx']['min_length']} entry, got {problem['input']!r}"
-    requirement = _bounds(model, name) or problem["msg"].removeprefix("Input should be ")
-    return f"{model.__name__}.{name} must be {requirement}{_unit(model, name)}, got {problem['input']!r}"
-
-
-def _bounds(model: type[BaseModel], name: str) -> str:
-    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one without."""
-    field = model.model_fields.get(name)
-    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-    constraints = [
-        f"{sign} {getattr(constraint, key):.6g}"
-        for constraint in (field.metadata if field is not None else [])
-        for key, sign in signs.items()
-        if hasattr(constraint, key)
-    ]
-    whole = field is not None and "int" in str(field.annotation) and "float" not in str(field.annotation)
-    kind = "a whole number" if whole else "a finite number"
-    return f"{kind} {' and '.join(constraints)}" if constraints else ""
-
-
-def _unit(model: type[BaseModel], name: str) -> str:
-    field = model.model_fields.get(name)
-    extra = field.json_schema_extra if field is not None else None
-    return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""
-
-
-class _Loader(yaml.SafeLoader):
-    """PyYAML's, with the numbers of YAML 1.2 and JSON: 1e3 is one too, which YAML 1.1 takes for text."""
-
-
-_EXPONENT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
-
-
-def parse_yaml(text: str) -> Any:
-    """What a text in YAML holds.
-
-    Raises:
-        yaml.YAMLError: It is not YAML.
-    """
-    return yaml.load(text, _Loader)
-
-
 def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] | None = None) -> ModelT:
     """Read a YAML file into a validated model.
 
@@ -193,14 +149,8 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
         ConfigurationError: The file is missing, is not a YAML mapping, or does not fit the model.
     """
     file = Path(path)
-    if file.is_dir():
-        raise ConfigurationError(f"{file} is a folder, a YAML file is needed")
-    if not file.is_file():
-        known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
-        listing = f"; found beside it: {', '.join(known)}" if known else ""
-        raise ConfigurationError(f"no configuration file at {file}{listing}")
     try:
-        content = parse_yaml(file.read_text(encoding="utf-8"))
+        content = parse_yaml(_text_of(file))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
     if content is None and changes:
@@ -209,9 +159,28 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
         got = "an empty file" if content is None else type(content).__name__
         raise ConfigurationError(f"{file} must hold a mapping of parameters, such as 'name: value', got {got}")
     try:
-        for key in content:
-            if not isinstance(key, str):
-                raise unknown_name(f"parameter of {model.__name__}", key, model.model_fields)
         return model(**{**content, **(changes or {})})
+    except ModelError as error:
+        raise ConfigurationError(f"in {file}: {error.named()}") from None
     except ConfigurationError as error:
         raise ConfigurationError(f"in {file}: {error}") from None
+
+
+def _text_of(file: Path) -> str:
+    """Text of a file that is one, and no longer than a configuration is.
+
+    Raises:
+        ConfigurationError: It is missing, a folder or too long, or cannot be read.
+    """
+    try:
+        if file.is_dir():
+            raise ConfigurationError(f"{file} is a folder, a YAML file is needed")
+        if not file.is_file():
+            known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+            listing = f"; found beside it: {', '.join(known)}" if known else ""
+            raise ConfigurationError(f"no configuration file at {shown(str(file))[1:-1]}{listing}")
+        if file.stat().st_size > 4 * LARGEST_TEXT:  # bytes of a character in UTF-8
+            raise ConfigurationError(f"{file} is too long for a configuration: more than {LARGEST_TEXT} characters")
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"{shown(str(file))} cannot be read: {error.strerror}") from None

@@ -1,8 +1,9 @@
 """Errors that teach: what was required, what was given, and which choices exist."""
 
 import difflib
+import reprlib
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 class ElasticError(ValueError):
@@ -44,6 +45,34 @@ def missing_extra(package: str, extra: str, purpose: str) -> MissingExtraError:
     )
 
 
+class _Shown(reprlib.Repr):
+    """Short representations, also of integers that Python does not convert to text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlist = self.maxtuple = self.maxdict = self.maxset = 24
+        self.maxstring = self.maxother = self.maxlong = _LONGEST_SHOWN // 2
+        self.maxlevel = 4
+
+    def repr_int(self, x: int, level: int) -> str:
+        if abs(x) >= 10**_LONGEST_SHOWN:
+            return f"a whole number of {x.bit_length()} bits"
+        return super().repr_int(x, level)
+
+    def repr_str(self, x: str, level: int) -> str:
+        return repr(x) if len(x) <= self.maxstring else super().repr_str(x, level)
+
+
+_LONGEST_SHOWN = 240
+_SHOWN = _Shown()
+
+
+def shown(value: Any) -> str:
+    """A given value as an error shows it: its representation, shortened where that would flood the terminal."""
+    text = _SHOWN.repr(value)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+
+
 def unknown_name(kind: str, name: object, choices: Iterable[str]) -> ConfigurationError:
     """The error for a name that does not exist, listing those that do.
 
@@ -52,7 +81,12 @@ def unknown_name(kind: str, name: object, choices: Iterable[str]) -> Configurati
         name: The name that was given.
         choices: The names that exist.
     """
+    return ConfigurationError(f"unknown {kind} {shown(name)}; {choices_listed(name, choices)}")
+
+
+def choices_listed(name: object, choices: Iterable[str]) -> str:
+    """The names that exist, and the one that is closest to what was given."""
     known = list(choices)
-    close = difflib.get_close_matches(str(name), known, n=1)
+    close = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, n=1) if isinstance(name, str) else []
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    return ConfigurationError(f"unknown {kind} {name!r}; choose one of: {', '.join(known)}.{hint}")
+    return f"choose one of: {', '.join(known)}.{hint}"

@@ -73,10 +73,14 @@ def quintic_moves(t: Array, start: float, moves: list[tuple[float, float, float]
     q, q_dot, q_ddot = np.full_like(t, start), np.zeros_like(t), np.zeros_like(t)
     position = start
     for begin, duration, target in moves:
-        blend, blend_dot, blend_ddot = quintic((t - begin) / duration)
-        q += (target - position) * blend
-        q_dot += (target - position) * blend_dot / duration
-        q_ddot += (target - position) * blend_ddot / duration**2
+        # before a move nothing of it adds to the angle, after it all does: the rest would cost time alone
+        last = int(np.searchsorted(t, begin + duration)) + 1
+        within = slice(int(np.searchsorted(t, begin)), last)
+        blend, blend_dot, blend_ddot = quintic((t[within] - begin) / duration)
+        q[within] += (target - position) * blend
+        q[last:] += target - position
+        q_dot[within] += (target - position) * blend_dot / duration
+        q_ddot[within] += (target - position) * blend_ddot / duration**2
         position = target
     return q, q_dot, q_ddot
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 import numpy as np
 from pydantic import Field, model_validator
 
-from elastic_env.config import Model, quantity
+from elastic_env.config import LARGEST_SEED, Model, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.plan import (
     QUINTIC_PEAK_ACCELERATION,
@@ -23,6 +23,20 @@ from elastic_env.plan import (
     quintic_moves,
 )
 from elastic_env.signals import Array, IntArray
+
+_LONGEST_S, _LONGEST_SUM_S = 7200.0, 36_000.0
+
+
+def _require_short(duration_s: float) -> None:
+    """Refuse a motion that lasts at least as long [s]: its tables hold every control step.
+
+    Raises:
+        ValueError: It is too long.
+    """
+    if duration_s > _LONGEST_S:
+        raise ValueError(
+            f"a motion must last at most {_LONGEST_S:g} s, got {duration_s:.0f} s or more; take fewer or quicker moves"
+        )
 
 
 class Hold(Model):
@@ -52,6 +66,14 @@ class Hold(Model):
     def _range_is_ordered(self) -> Self:
         if self.upper <= self.lower:
             raise ValueError(f"upper must exceed lower, got lower {self.lower} and upper {self.upper}")
+        return self
+
+    @model_validator(mode="after")
+    def _ends_in_time(self) -> Self:
+        angles = self.angles
+        way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
+        moves = max(QUINTIC_PEAK_RATE * way / self.rate, (2 * self.positions + 1) * self.shortest_move_s)
+        _require_short(STAND_S + moves + 2 * self.positions * (self.settle_s + self.measure_s))
         return self
 
     @property
@@ -181,13 +203,24 @@ class Multisine(_Oscillation):
     amplitude: float = quantity("rad", 0.4, gt=0, lt=np.pi, description="largest angle from the middle")
     lowest_hz: float = quantity("Hz", 0.1, gt=0, description="lowest frequency")
     highest_hz: float = quantity("Hz", 1.0, gt=0, description="highest frequency")
-    components: int = quantity("1", 5, ge=2, description="number of sines")
-    seed: int | None = quantity("1", None, ge=0, description="seed of the phases; None draws new ones per episode")
+    components: int = quantity("1", 5, ge=2, le=100, description="number of sines")
+    seed: int | None = quantity(
+        "1", None, ge=0, le=LARGEST_SEED, description="seed of the phases; None draws new ones per episode"
+    )
 
     @model_validator(mode="after")
     def _frequencies_are_ordered(self) -> Self:
         if self.highest_hz <= self.lowest_hz:
             raise ValueError(f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz")
+        return self
+
+    @model_validator(mode="after")
+    def _is_summed_in_time(self) -> Self:
+        if self.components * self.duration_s > _LONGEST_SUM_S:
+            raise ValueError(
+                f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got {self.components} x "
+                f"{self.duration_s:g} s; take fewer sines or less time"
+            )
         return self
 
     @property
@@ -225,7 +258,14 @@ class Steps(Model):
     move_s: float = quantity("s", 1.0, gt=0, le=3600, description="duration of a move")
     rest_s: float = quantity("s", 1.0, ge=0, le=3600, description="rest after a move")
     moves: int = quantity("1", 5, ge=1, le=1000, description="number of moves")
-    seed: int | None = quantity("1", None, ge=0, description="seed of the levels; None draws new ones per episode")
+    seed: int | None = quantity(
+        "1", None, ge=0, le=LARGEST_SEED, description="seed of the levels; None draws new ones per episode"
+    )
+
+    @model_validator(mode="after")
+    def _ends_in_time(self) -> Self:
+        _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
+        return self
 
     @property
     def is_random(self) -> bool:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from elastic_env.config import Model, quantity
+from elastic_env.config import Model, Title, quantity
 from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.robots.dynamixel import BACKLASH_BOUND_RAD
 from elastic_env.sensors import AttitudeSensor
@@ -18,7 +18,7 @@ from elastic_env.sensors import AttitudeSensor
 class Scenario(Model):
     """Difference between the true plant and the assumed model, and the quality of the sensors."""
 
-    name: str = "custom"
+    name: Title = "custom"
     stiffness_scale: float = quantity("1", 1.0, gt=0, description="true over assumed stiffness of every joint")
     friction_scale: float = quantity("1", 1.0, ge=0, description="share of the joints' friction that acts, 0 for none")
     backlash_rad: float = quantity("rad", 0.0, ge=0, description="dead band of every joint, unknown to the compensator")
@@ -28,7 +28,7 @@ class Scenario(Model):
     pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="testbed: true over assumed mass of pendulum")
     torso_load_kg: float = quantity("kg", 0.0, ge=0, description="walker: mass on the torso, not in the model")
     push_n: float = quantity("N", 0.0, ge=0, description="walker: force of a push on the torso, anywhere in the walk")
-    push_s: float = quantity("s", 0.1, gt=0, description="walker: duration of the push")
+    push_s: float = quantity("s", 0.1, gt=0, le=600, description="walker: duration of the push")
     slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5, description="walker: slope of the floor, direction drawn")
     encoder_counts: bool = True
     """Whether the encoders have whole counts."""
@@ -80,6 +80,9 @@ GROUNDS: dict[str, Scenario] = {
     ),
 }
 
+_LONGEST_JOINED = 1000
+"""Characters of a joined name that are looked at."""
+
 Change = Callable[[Scenario], dict[str, Any]]
 
 CHANGES: dict[str, Change] = {
@@ -122,7 +125,7 @@ def make_scenario(name: "str | Scenario", testbed: bool = False) -> Scenario:
     """
     if isinstance(name, Scenario):
         return name
-    first, *rest = str(name).split("+")
+    first, *rest = str(name)[:_LONGEST_JOINED].split("+")
     ground, changes = (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
     parameters: dict[str, Any] = {}
     for change in changes:

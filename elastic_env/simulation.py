@@ -249,13 +249,21 @@ def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Si
     return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
 
 
+_MOST_SUBSTEPS = 1000
+
+
 def substeps(control_period_s: float, timestep_s: float) -> int:
     """Physics steps in a control period.
 
     Raises:
-        ConfigurationError: The control period is no multiple of the physics step.
+        ConfigurationError: The control period is no multiple of the physics step, or holds too many of them.
     """
     ratio = control_period_s / timestep_s
+    if ratio > _MOST_SUBSTEPS:
+        raise ConfigurationError(
+            f"timestep_s must be at least {control_period_s / _MOST_SUBSTEPS:g} s, a {_MOST_SUBSTEPS}th of the control "
+            f"period, got {timestep_s:g} s"
+        )
     if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
         raise ConfigurationError(
             f"timestep_s must divide the control period of {control_period_s:g} s, got {timestep_s:g} s"

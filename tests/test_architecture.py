@@ -68,7 +68,7 @@ def test_nobody_draws_from_global_randomness(file: Path) -> None:
 
 
 LAYERS = [
-    ("errors", "config", "signals", "headless", "step_info", "compiled"),
+    ("errors", "yaml_text", "json_text", "config_problems", "config", "signals", "headless", "step_info", "compiled"),
     ("rows",),
     ("elasticity", "sensors", "metrics", "plan"),
     ("rigid_body",),

@@ -10,10 +10,11 @@ import pytest
 
 from baselines.correction import ResidualSettings
 from baselines.policies import PolicyOptions
-from elastic_env.config import Model, load_yaml, parse_yaml, quantity
+from elastic_env.config import Model, load_yaml, quantity
 from elastic_env.entry_points import configure_testbed, configure_walk
 from elastic_env.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
 from elastic_env.tasks.testbed_config import TestbedConfig
+from elastic_env.yaml_text import parse_yaml
 from train.compare import CompareConfig
 from train.train_config import TrainConfig
 
@@ -52,11 +53,11 @@ class Outer(Model):
         ({"rate": 1.0, "raet": 2.0}, r"unknown parameter of Outer 'raet'; choose one of: rate, count.*'rate'"),
         (
             {"rate": 1.0, "inner": {"length": 3.0}},
-            r"Inner\.length must be a finite number > 0 and <= 2 \[m\], got 3\.0",
+            r"Outer\.inner\.length must be a finite number > 0 and <= 2 \[m\], got 3\.0",
         ),
         (
             {"rate": 1.0, "inner": {"lenght": 1.0}},
-            r"unknown parameter of Inner 'lenght'; choose one of: length.*'length'",
+            r"unknown parameter of inner 'lenght'; choose one of: length.*'length'",
         ),
         ({"rate": 1.0, "inner": 5}, r"Outer\.inner must be a mapping of parameters, got 5"),
     ],
@@ -181,12 +182,12 @@ def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:
         ("rate: [1, 2\n", r"outer\.yaml is not valid YAML"),
         ("rate: 1\n  count: 2\n", r"outer\.yaml is not valid YAML"),
         ("rate: !!python/object/apply:os.getcwd []\n", r"outer\.yaml is not valid YAML"),
-        ("rate: -1\n", r"in .*outer\.yaml: Outer\.rate must be a finite number > 0 \[Hz\], got -1"),
-        ("rate: .nan\n", r"in .*outer\.yaml: Outer\.rate must be a finite number > 0 \[Hz\], got nan"),
-        ("rate: 1\nspeed: 2\n", r"in .*outer\.yaml: unknown parameter of Outer 'speed'; choose one of: rate, count"),
+        ("rate: -1\n", r"in .*outer\.yaml: rate must be a finite number > 0 \[Hz\], got -1"),
+        ("rate: .nan\n", r"in .*outer\.yaml: rate must be a finite number > 0 \[Hz\], got nan"),
+        ("rate: 1\nspeed: 2\n", r"in .*outer\.yaml: unknown parameter 'speed'; choose one of: rate, count"),
         (
             "rate: 1\ninner: {width: 1}\n",
-            r"in .*outer\.yaml: .*unknown parameter of Inner 'width'; choose one of: length",
+            r"in .*outer\.yaml: .*unknown parameter of inner 'width'; choose one of: length",
         ),
         ("rate: 1\n2: 3\n", r"outer\.yaml.*parameter.*2"),
         ("rate: 1\nnull: 3\n", r"outer\.yaml.*parameter.*None"),

@@ -143,13 +143,19 @@ def test_durations_may_be_numbers_of_numpy(given: Any) -> None:
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"step_period": (0.5, -0.1, 0.5)}, r"Gait.single_support_s must be a finite number > 0 \[s\], got -0.1"),
-        ({"step_period": 3, "num_steps": 0}, "Gait.num_steps must be a whole number >= 1, got 0"),
+        (
+            {"step_period": (0.5, -0.1, 0.5)},
+            r"Gait.single_support_s must be a finite number > 0 and <= 3600 \[s\], got -0.1",
+        ),
+        ({"step_period": 3, "num_steps": 0}, "Gait.num_steps must be a whole number >= 1 and <= 1000, got 0"),
         ({"step_period": 3, "lift_m": 0.0}, r"Gait.lift_m must be a finite number > 0 \[m\], got 0.0"),
-        ({"step_period": ["0.5", "0.6", "0.5"]}, r"Gait.double_support_s must be a finite number > 0 \[s\], got '0.5'"),
-        ({"step_period": [True] * 3}, r"Gait.double_support_s must be a finite number > 0 \[s\], got True"),
-        ({"step_period": 3, "num_steps": "2"}, "Gait.num_steps must be a whole number >= 1, got '2'"),
-        ({"step_period": 3, "num_steps": True}, "Gait.num_steps must be a whole number >= 1, got True"),
+        (
+            {"step_period": ["0.5", "0.6", "0.5"]},
+            r"Gait.double_support_s must be a finite number > 0 and <= 3600 \[s\], got '0.5'",
+        ),
+        ({"step_period": [True] * 3}, r"Gait.double_support_s must be a finite number > 0 and <= 3600 \[s\], got True"),
+        ({"step_period": 3, "num_steps": "2"}, "Gait.num_steps must be a whole number >= 1 and <= 1000, got '2'"),
+        ({"step_period": 3, "num_steps": True}, "Gait.num_steps must be a whole number >= 1 and <= 1000, got True"),
         ({"step_period": 3, "lift": 0.1}, "unknown parameter of Gait 'lift'.*Did you mean 'lift_m'"),
         (
             {"step_period": (0.3, 0.5, 0.08), "transfer": "ramp"},

@@ -1329,9 +1329,12 @@ def test_actions_of_wrong_shape_name_the_right_one(shape: tuple[int, ...]) -> No
             r"single_support_s must be a multiple of the control period of 0\.004 s, got 0\.501 s; "
             r"the nearest are 0\.5 s and 0\.504 s",
         ),
-        ({"step_period": [0, 0.5, 0.3]}, r"Gait\.double_support_s must be a finite number > 0 \[s\], got 0"),
-        ({"num_steps": 0}, r"Gait\.num_steps must be a whole number >= 1, got 0"),
-        ({"num_steps": 1.5}, r"Gait\.num_steps must be a whole number >= 1, got 1\.5"),
+        (
+            {"step_period": [0, 0.5, 0.3]},
+            r"Gait\.double_support_s must be a finite number > 0 and <= 3600 \[s\], got 0",
+        ),
+        ({"num_steps": 0}, r"Gait\.num_steps must be a whole number >= 1 and <= 1000, got 0"),
+        ({"num_steps": 1.5}, r"Gait\.num_steps must be a whole number >= 1 and <= 1000, got 1\.5"),
         ({"gait": {"hip_height_m": 0.75}}, r"foot is out of reach at 0\.000 s: 0\.6500 m.*at most 0\.6 m; lower hip_h"),
         (
             {"gait": {"lift": 0.1}},

@@ -7,7 +7,7 @@ from typing import Any
 
 import stable_baselines3
 
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.errors import ConfigurationError, shown, unknown_name
 from train.train_config import CONSTANTS
 
 
@@ -29,6 +29,12 @@ def algorithm_class(name: str) -> Any:
     return getattr(stable_baselines3, name)
 
 
+_BAD_OPTIONS = (
+    TypeError, ValueError, AssertionError, AttributeError, ArithmeticError, LookupError, MemoryError, RuntimeError,
+)  # fmt: skip
+"""What algorithms raise for options that they cannot take, such as arrays beyond the memory."""
+
+
 @contextmanager
 def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
     """Name algorithm and options in what it raises while it is built from them.
@@ -40,7 +46,8 @@ def options_named(algorithm: str, options: Mapping[str, Any]) -> Iterator[None]:
         yield
     except ConfigurationError:
         raise
-    except (TypeError, ValueError, AssertionError, AttributeError, ArithmeticError) as error:
+    except _BAD_OPTIONS as error:
         raise ConfigurationError(
-            f"{algorithm} cannot be built with algorithm_options {dict(options)}: {error or type(error).__name__}"
+            f"{algorithm} cannot be built with algorithm_options {shown(dict(options))}: "
+            f"{error or type(error).__name__}"
         ) from error

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from elastic_env.config import Model, load_yaml, quantity
+from elastic_env.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import environment
 from train.evaluate import Evaluation
+from train.kinds import is_a
 from train.runs import run_folder
 from train.workers import run_conditions
 
@@ -30,13 +31,13 @@ class BenchCase(Model):
     """A short rollout and the figures that it must keep."""
 
     env: str
-    policy: str
+    policy: Locator
     """A baseline, residual:PATH, or "module:function"."""
-    scenario: str = "nominal"
+    scenario: Title = "nominal"
     reference: Motion | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    seed: int = 0
-    figures: dict[str, float | None] = Field(min_length=1)
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2, description="seed of the episode")
+    figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""
 
     @property
@@ -50,9 +51,12 @@ class BenchCase(Model):
 class BenchConfig(Model):
     """The rollouts of `elastic bench`."""
 
-    name: str = "bench"
-    margin: float = quantity("1", 0.05, ge=0, description="relative amount by which a figure may exceed the accepted")
-    cases: list[BenchCase] = Field(min_length=1)
+    name: Title = "bench"
+    margin: float = quantity(
+        "1", 0.05, ge=0, le=100, description="relative amount by which a figure may exceed the accepted"
+    )
+    _kind = model_validator(mode="before")(is_a("bench"))
+    cases: list[BenchCase] = Field(min_length=1, max_length=MOST_ENTRIES)
 
 
 @dataclass(frozen=True)

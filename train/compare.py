@@ -8,49 +8,53 @@ from typing import Any, Self
 from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
-from elastic_env.config import Model, quantity
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, quantity
+from elastic_env.errors import ConfigurationError, shown, unknown_name
 from train import plots
 from train.changes import changes, merged
 from train.changes_tables import print_changes, write_statistics
-from train.conditions import Condition, Motion, PolicySpec
+from train.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
 from train.environments import Environment, Reference, environment
 from train.evaluate import Evaluation, make_policy, with_one_world
 from train.families import expand
 from train.figures import draw_figures
+from train.kinds import is_a
 from train.report import Results, require_plotly, write_report
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
 from train.workers import run_conditions
 
+_MOST_CELLS = 10_000
+_MOST_JOBS = 1024
+
 
 class Sweep(Model):
     """An option of the policies that takes several values, for curves instead of time series."""
 
-    option: str
+    option: Title
     """Option of the policies, such as stiffness_scale."""
-    values: list[float] = Field(min_length=2)
-    label: str | None = None
+    values: list[float] = Field(min_length=2, max_length=MOST_ENTRIES)
+    label: Title | None = None
     """What the axis says; None for the option's name."""
 
 
 class CompareConfig(Model):
     """A comparison, as read from `configs/*.yaml`."""
 
-    name: str = Field(pattern=r"^[\w.-]*\w$")
+    name: str = Field(pattern=r"^[\w.-]*\w$", max_length=100)
     """Name of the result folder under runs/: letters, digits, dots, dashes."""
     env: str = "testbed"
-    references: list[Motion] = Field(min_length=1)
+    references: list[Motion] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Motions, see `Condition.reference`; default the environment's."""
-    scenarios: list[str] = Field(default=["nominal"], min_length=1)
+    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
     policies: list[PolicySpec] = Field(
-        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1
+        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1, max_length=MOST_ENTRIES
     )
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
-    episodes: int = quantity("1", 1, ge=1, description="episodes per cell")
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="episodes per cell")
     scenario_episodes: dict[str, int] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
-    seed: int = quantity("1", 0, ge=0, description="seed of the first episode")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode")
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
     figure_policies: list[str] = []
@@ -65,6 +69,8 @@ class CompareConfig(Model):
     def _environment_has_a_default(cls, values: Any) -> Any:
         name = values.get("env", "testbed") if isinstance(values, dict) else None
         return {"references": [environment(name).default_reference], **values} if isinstance(name, str) else values
+
+    _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
 
     @field_validator("policies", mode="before")
     @classmethod
@@ -91,12 +97,15 @@ class CompareConfig(Model):
         for scenario, episodes in self.scenario_episodes.items():
             if scenario not in self.scenarios:
                 raise unknown_name("scenario with episodes of its own", scenario, self.scenarios)
-            if episodes < 1:
-                raise ConfigurationError(f"scenario_episodes of {scenario!r} must be >= 1, got {episodes}")
+            if not 1 <= episodes <= MOST_EPISODES:
+                raise ConfigurationError(
+                    f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got {shown(episodes)}"
+                )
         for name, scenarios in self.groups.items():
             if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
                 raise ConfigurationError(
-                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; got {scenarios}"
+                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; "
+                    f"got {shown(scenarios)}"
                 )
             for scenario in scenarios:
                 if scenario not in self.scenarios:
@@ -113,6 +122,13 @@ class CompareConfig(Model):
             ConfigurationError: Residuals that do not exist, or are no family.
         """
         entrants = expand(self.policies, with_bases)
+        swept = len(self.sweep.values) if self.sweep else 1
+        cells = len(self.references) * len(self.scenarios) * len(entrants) * swept
+        if cells > _MOST_CELLS:
+            raise ConfigurationError(
+                f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)} references x "
+                f"{len(self.scenarios)} scenarios x {len(entrants)} policies x {swept} values are {cells}; split it"
+            )
         return [
             Condition(
                 env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
@@ -173,8 +189,9 @@ def compare(
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
         ResultsExistError: The output folder holds results.
     """
-    if jobs < 0:
-        raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {jobs}")
+    if not 0 <= jobs <= _MOST_JOBS:
+        bound = ">= 0" if jobs < 0 else f"<= {_MOST_JOBS}"
+        raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {shown(jobs)}")
     plots.require_matplotlib()
     if report:
         require_plotly()
@@ -199,7 +216,7 @@ def compare(
 def _require_each_once(what: str, values: Sequence[object]) -> None:
     for value in values:
         if values.count(value) > 1:
-            raise ConfigurationError(f"the {what} {value!r} stands twice; its episodes would count double")
+            raise ConfigurationError(f"the {what} {shown(value)} stands twice; its episodes would count double")
 
 
 def try_out(conditions: Sequence[Condition]) -> None:

@@ -4,8 +4,12 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, field_validator
 
-from elastic_env.config import Model, quantity
+from elastic_env.config import LARGEST_SEED, Locator, Model, Title, quantity
+from elastic_env.errors import shown
 from train.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
+
+MOST_EPISODES = 100_000
+"""Episodes of a cell."""
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
@@ -17,7 +21,8 @@ def _options(value: dict[str, Any]) -> dict[str, Any]:
 def _reference(value: Any) -> Reference:
     if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
         raise ValueError(
-            f"a reference is a name, a step period [s], three durations [s] or a mapping of parameters, got {value!r}"
+            "a reference is a name, a step period [s], three durations [s] or a mapping of parameters, "
+            f"got {shown(value)}"
         )
     if isinstance(value, dict):
         _refuse(value.keys() & set(RESERVED), "part of a reference")
@@ -38,8 +43,8 @@ Motion = Annotated[Any, AfterValidator(_reference)]
 class PolicySpec(Model):
     """A policy of a comparison: a baseline's name, or "module:function" for one's own, with options."""
 
-    name: str
-    label: str | None = None
+    name: Locator
+    label: Locator | None = None
     """How tables and figures call it; None for its name."""
     options: dict[str, Any] = {}
     """Keyword arguments of `baselines.make`, or of one's own function."""
@@ -79,13 +84,15 @@ class Condition(Model):
     or a mapping with `step_period` and further arguments of the environment."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
-    scenario: str = "nominal"
+    scenario: Title = "nominal"
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
     swept: dict[str, float] = {}
     """The policy's option that a sweep varies, and its value here."""
-    episodes: int = quantity("1", 1, ge=1, description="number of episodes")
-    seed: int = quantity("1", 0, ge=0, description="seed of the first episode; the next ones follow")
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
+    seed: int = quantity(
+        "1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode; the next ones follow"
+    )
 
     _checked = field_validator("env_options")(_options)
 

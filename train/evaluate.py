@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.static_points import HoldRecorder, StaticPoints
-from elastic_env.errors import ConfigurationError
+from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array, BoolArray
 from train.conditions import Condition, PolicySpec
@@ -84,11 +84,17 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
         raise _not_a_policy(spec, "the module must have its full name")
     try:
         function = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         raise _not_a_policy(spec, str(error)) from None
     if not callable(function):
         raise _not_a_policy(spec, f"{attribute} is no function but of type {type(function).__name__}")
-    return function(env, **options)
+    try:
+        return function(env, **options)
+    except ElasticError:
+        raise
+    except Exception as error:
+        problem = f"{attribute}(env, ...) raised {type(error).__name__}: {error}"
+        raise _not_a_policy(spec, problem) from error
 
 
 def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from baselines.policies import RESIDUAL
-from baselines.residual import ResidualDescription, read_description, shipped
+from baselines.residual import DESCRIPTION, ResidualDescription, read_description, shipped
 from elastic_env.errors import ConfigurationError
 from train.conditions import Member, PolicySpec
+from train.environments import ENVIRONMENTS
 
 _WILD = re.compile(r"[*?\[]")
 _NEAREST = 5
@@ -70,6 +71,8 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
             entrants.append(Entrant(policy))
             continue
         members = _members(policy.name.removeprefix(RESIDUAL))
+        for folder, _, said in members:
+            _require_motion(folder, said)
         description = members[0][2]
         base = next((known for known in bases if _plays(known, description, policy)), None)
         if base is None:
@@ -95,16 +98,16 @@ def is_residual(policy: PolicySpec) -> bool:
 def origin(members: Sequence[Member]) -> Origin:
     """How a family was trained, from its files."""
     descriptions = [read_description(Path(member.folder)) for member in members]
-    config = descriptions[0].training.get("config", {})
-    scenarios = config.get("scenarios")
-    wanted, had = set(config.get("seeds", ())), {member.training_seed for member in members}
+    config = descriptions[0].origin.config
+    scenarios = config.scenarios
+    wanted, had = set(config.seeds), {member.training_seed for member in members}
     return Origin(
         scenarios=None if scenarios is None else tuple(scenarios),
         environment=descriptions[0].robot,
-        reference=config.get("reference"),
+        reference=config.reference,
         missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
         folders=tuple(member.folder for member in members),
-        commits=tuple(dict.fromkeys(str(d.training.get("commit") or "unknown") for d in descriptions)),
+        commits=tuple(dict.fromkeys(d.origin.commit or "unknown" for d in descriptions)),
     )
 
 
@@ -127,6 +130,17 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
     return members
 
 
+def _require_motion(folder: Path, description: ResidualDescription) -> None:
+    """Refuse a residual whose training names a motion that its environment cannot read: the report would need it."""
+    known, reference = ENVIRONMENTS.get(description.robot), description.origin.config.reference
+    if known is None or reference is None:
+        return
+    try:
+        known.label(known.arguments(reference)[known.motion])
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{folder / DESCRIPTION}: training.config.reference: {error}") from None
+
+
 def _nearest(pattern: Path) -> str:
     """What lies where the folders of a pattern end to exist, the most similar names first, and what is shipped."""
     there = next(path for path in pattern.parents if path.is_dir() and not _WILD.search(str(path)))
@@ -139,9 +153,8 @@ def _nearest(pattern: Path) -> str:
 
 def _training_seed(folder: Path, description: ResidualDescription) -> int | None:
     """As the residual says it, or the name of its folder; None where neither does."""
-    seed = description.training.get("seed")
-    if isinstance(seed, int) and not isinstance(seed, bool):
-        return seed
+    if description.origin.seed is not None:
+        return description.origin.seed
     found = _SEED.findall(str(folder))
     return int(found[-1]) if found else None
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
 from baselines.identification import Identification, identify
-from elastic_env.config import Model, quantity
+from elastic_env.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.robots.testbed import Pendulum
 from train import plots
 from train.runs import run_folder
@@ -25,13 +25,13 @@ from train.workers import plain_progress, show_progress
 class IdentifyConfig(Model):
     """What `elastic identify` does."""
 
-    scenario: str = "nominal"
+    scenario: Title = "nominal"
     """Scenario of the simulated testbed."""
     stiffness: float | None = quantity("N·m/rad", None, gt=0, description="true K; None for the paper's")
     second_mass: float | None = quantity("1", None, gt=0, description="factor on the pendulum's mass in a second run")
-    positions: int = quantity("1", 20, ge=5, description="number of static positions")
-    seed: int = quantity("1", 0, ge=0, description="seed of the first run")
-    repeats: int = quantity("1", 1, ge=1, description="number of runs with seeds of their own")
+    positions: int = quantity("1", 20, ge=5, le=200, description="number of static positions")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2, description="seed of the first run")
+    repeats: int = quantity("1", 1, ge=1, le=10_000, description="number of runs with seeds of their own")
     hardware: dict[str, Any] = {}
     """Arguments of `elastic_env/HardwareTestbed-v0` for a real joint; empty for a simulated one."""
 

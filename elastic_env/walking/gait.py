@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import model_validator
 
 from elastic_env.config import Model, plain_numbers, quantity
-from elastic_env.errors import ConfigurationError
+from elastic_env.errors import ConfigurationError, shown
 from elastic_env.plan import STAND_S, control_times, minimum_jerk
 from elastic_env.signals import Array, BoolArray, IntArray
 
@@ -24,6 +24,9 @@ STEP_DURATIONS = {24.0: (7.0, 10.0, 7.0), 3.0: (1.1, 0.8, 1.1), 1.6: (0.5, 0.6, 
 TRANSITION_S = 0.2
 """Half-width of the time around a lift-off or touch-down that counts as transition [s]."""
 
+LONGEST_WALK_S = 600.0
+"""Longest walk that is planned, with standing [s]: its tables hold every control step."""
+
 _RAMP_SHIFT_S = 0.1
 _RAMP_INWARD_M = 0.02
 
@@ -31,10 +34,10 @@ _RAMP_INWARD_M = 0.02
 class Gait(Model):
     """A walk in place."""
 
-    double_support_s: float = quantity("s", 1.1, gt=0, description="first double support of a step")
-    single_support_s: float = quantity("s", 0.8, gt=0, description="single support of a step")
-    last_double_support_s: float = quantity("s", 1.1, gt=0, description="last double support of a step")
-    num_steps: int = quantity("1", 4, ge=1, description="number of steps")
+    double_support_s: float = quantity("s", 1.1, gt=0, le=3600, description="first double support of a step")
+    single_support_s: float = quantity("s", 0.8, gt=0, le=3600, description="single support of a step")
+    last_double_support_s: float = quantity("s", 1.1, gt=0, le=3600, description="last double support of a step")
+    num_steps: int = quantity("1", 4, ge=1, le=1000, description="number of steps")
     lift_m: float = quantity("m", 0.025, gt=0, description="height to which the swing foot is lifted")
     hip_height_m: float = quantity("m", 0.66, gt=0, description="height of the hip axes over the ground")
     transfer: Literal["smooth", "ramp"] = "smooth"
@@ -82,7 +85,7 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
         known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
         raise ConfigurationError(
             f"step_period must be one of {known} [s], or the three durations of double, single and double support [s] "
-            f"such as [0.8, 0.6, 0.8]; got {step_period!r}"
+            f"such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
         )
     names = ("double_support_s", "single_support_s", "last_double_support_s")
     return Gait(**dict(zip(names, durations, strict=True)), **parameters)
@@ -113,11 +116,12 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     """Phases of a gait.
 
     Raises:
-        ConfigurationError: A duration is no multiple of the control period.
+        ConfigurationError: A duration is no multiple of the control period, or the walk is too long.
     """
     names = ("double_support_s", "single_support_s", "last_double_support_s")
     first, single, _ = (_whole_steps(name, getattr(gait, name), control_period_s) for name in names)
     period = sum(_whole_steps(name, getattr(gait, name), control_period_s) for name in names)
+    _require_short(gait)
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)
     since = np.arange(len(time)) - begin  # control steps since the walk began
@@ -126,7 +130,7 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     swing = np.clip(within / single, 0.0, 1.0)
     lift_offs = np.arange(gait.num_steps) * period + first
     events = np.concatenate([lift_offs, lift_offs + single])
-    nearest = np.abs(since[:, None] - events).min(axis=1)
+    nearest = _distance(since, np.sort(events))
     walking = (since > 0) & (since <= gait.num_steps * period)
     return Timing(
         time=time,
@@ -136,6 +140,13 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
         transition=walking & (nearest * control_period_s <= TRANSITION_S + 1e-9),
         walking=walking,
     )
+
+
+def _distance(steps: IntArray, events: IntArray) -> IntArray:
+    """Control steps from each step to the nearest of some events in order, (T,)."""
+    after = np.searchsorted(events, steps)
+    last = len(events) - 1
+    return np.minimum(np.abs(steps - events[np.minimum(after, last)]), np.abs(steps - events[np.maximum(after - 1, 0)]))
 
 
 def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
@@ -185,6 +196,14 @@ def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, flo
                 shifts.append((touch_down, end - touch_down, support, middle))
         last, begin = support, end
     return shifts
+
+
+def _require_short(gait: Gait) -> None:
+    if gait.duration_s > LONGEST_WALK_S:
+        raise ConfigurationError(
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps of "
+            f"{gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter ones"
+        )
 
 
 def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:

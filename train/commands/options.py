@@ -1,6 +1,5 @@
 """What the commands of `elastic` share: console, options of hardware, and how options are read."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,16 +9,15 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from elastic_env.config import parse_yaml
+from elastic_env.config_problems import ModelError, ParameterPath
 from elastic_env.errors import ConfigurationError
+from elastic_env.yaml_text import parse_yaml
 
 CONSOLE = Console()
 """Where the commands say what they do."""
 
 DEFAULT_SCENARIO = "nominal"
 """Scenario of a simulation where none is named."""
-
-_PARAMETER = re.compile(r"^(?:(?:\w+Config|Condition)\.(\w+)|(reference)s?)(?:\.\d+)?(?=:| must be )", re.MULTILINE)
 
 
 @dataclass
@@ -75,9 +73,17 @@ def options_named() -> Iterator[None]:
     """Errors of a configuration that is made from options name the options in place of its parameters."""
     try:
         yield
-    except ConfigurationError as error:
-        named = _PARAMETER.sub(lambda found: "--" + (found[1] or found[2]).replace("_", "-"), str(error))
-        raise ConfigurationError(named) from None
+    except ModelError as error:
+        raise ConfigurationError(error.named(spelt=_option)) from None
+
+
+_OF_ONE = {"references": "reference", "scenarios": "scenario", "policies": "policy"}
+"""Options that give a list of a configuration its only entry."""
+
+
+def _option(path: ParameterPath) -> str:
+    """A parameter as the option that sets it."""
+    return "--" + _OF_ONE.get(str(path[0]), str(path[0])).replace("_", "-") if path else ""
 
 
 def motion(env: str, text: str | None) -> Any:

@@ -1,0 +1,53 @@
+"""YAML of configurations: its limits, and what it does not make of text."""
+
+import time
+
+import pytest
+import yaml
+
+from elastic_env.yaml_text import DEEPEST_NESTING, parse_yaml
+
+LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 9)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LAUGHS, "at most 20000 values, aliases counted"),
+        ("&a [*a]", r"alias \*a stands within what it names"),
+        ("[" * 5000, "nested at most 30 deep"),
+        ("a: " + "9" * 5000, "at most 40 characters, got 5000"),
+        ("x" * 200_000, "at most 100000 characters, got 200000"),
+        ("a: !!timestamp x", "the tag '!!timestamp' has no meaning here"),
+        ("a: !!binary aGk=", "the tag '!!binary' has no meaning here"),
+        ("a: 0b_", "'0b_' is no number"),
+        ("a: 1\nb: 2\na: 3", "the key 'a' stands twice in one mapping"),
+        ("a: {[1]: 2}", "name of a parameter must be text, got a sequence"),
+        ("on: 2", "name of a parameter must be text, got True"),
+        ('a: "\\0"', "zero bytes"),
+        ('a: "\\ud800"', "halves of characters"),
+    ],
+)
+def test_what_is_beyond_the_limits_is_refused_at_once(text: str, message: str) -> None:
+    """Catches gigabytes from 400 bytes, a RecursionError, integers that cannot be printed, and keys that are lost."""
+    began = time.process_time()
+    with pytest.raises(yaml.YAMLError, match=message):
+        parse_yaml(text)
+    assert time.process_time() - began < 5.0
+
+
+@pytest.mark.parametrize("text", ["2001-99-99", "2001-01-01", "2001-01-01 10:00:00"])
+def test_dates_are_text(text: str) -> None:
+    """Catches YAML's dates, which are no configuration's, and a traceback for those of no calendar."""
+    assert parse_yaml(f"a: {text}") == {"a": text}
+
+
+def test_what_is_within_the_limits_is_read() -> None:
+    """Catches limits that take aliases, merges and nesting with them."""
+    assert parse_yaml("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: [*a, *a]") == {
+        "a": {"x": 1, "y": 2}, "b": {"x": 1, "y": 3}, "c": [{"x": 1, "y": 2}] * 2,
+    }  # fmt: skip
+    depth = DEEPEST_NESTING - 1
+    assert parse_yaml("[" * depth + "1" + "]" * depth) is not None

@@ -1,0 +1,36 @@
+"""Which configuration is which, so that one that is given to the wrong command is recognised."""
+
+from collections.abc import Callable
+from typing import Any
+
+TELLING = {
+    "comparison": (
+        "elastic compare",
+        {"references", "policies", "episodes", "scenario_episodes", "figure_policies", "sweep", "groups"},
+    ),
+    "training": (
+        "elastic train",
+        {"weights", "base", "base_options", "settings", "algorithm", "algorithm_options", "anneal", "clip", "worlds",
+         "decisions", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_every"},
+    ),
+    "bench": ("elastic bench", {"cases", "margin"}),
+}  # fmt: skip
+"""Command of each kind, and keys that no other kind has."""
+
+
+def is_a(kind: str) -> Callable[[Any], Any]:
+    """A check of raw parameters: they are of a kind, or of none in particular.
+
+    Raises:
+        ValueError: More of the keys are of another kind.
+    """
+
+    def check(values: Any) -> Any:
+        given = set(values) if isinstance(values, dict) else set()
+        count = {name: len(given & keys) for name, (_, keys) in TELLING.items()}
+        likely = max(count, key=lambda name: count[name])
+        if count[likely] > count[kind]:
+            raise ValueError(f"this is the configuration of a {likely}: {TELLING[likely][0]} FILE")
+        return values
+
+    return check
