@@ -11,6 +11,7 @@ from baselines.compensators import DynamicCompensator, GravityCompensator
 from baselines.correction import Corrected, ResidualSettings
 from baselines.policies import RESIDUAL, make, policy_names
 from baselines.policy import Policy
+from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 
 __all__ = [
     "RESIDUAL",
@@ -20,6 +21,8 @@ __all__ = [
     "GravityCompensator",
     "Policy",
     "ResidualSettings",
+    "ResidualVectorWrapper",
+    "ResidualWrapper",
     "make",
     "policy_names",
 ]

@@ -13,8 +13,8 @@ from baselines.correction import Corrected, ResidualSettings
 from baselines.evidence import ERROR_SCALE, LOAD_SCALE, Evidence, evidence
 from baselines.features import Features
 from baselines.residual import Network, ResidualDescription, ResidualPolicy
+from baselines.residual_env import ResidualWrapper
 from elastic_env.errors import ConfigurationError
-from train.residual_env import ResidualWrapper
 
 HIP_ROLLS, PERIOD = [1, 7], 25
 

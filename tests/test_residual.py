@@ -30,11 +30,11 @@ from baselines.residual import (
     save_residual,
     shipped,
 )
+from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 from elastic_env.errors import ActionError, ConfigurationError
 from elastic_env.signals import Array
 from train.cli import main
 from train.export import network_of
-from train.residual_env import ResidualVectorWrapper, ResidualWrapper
 from train.sb3_env import SB3VecEnv
 
 WALKER, TESTBED = "elastic_env/WalkInPlace-v0", "elastic_env/Testbed-v0"

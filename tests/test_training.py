@@ -21,6 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import baselines
 from baselines.residual import load_residual
+from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.errors import ConfigurationError, ElasticError
 from elastic_env.signals import Array
 from train.bench import BenchCase
@@ -30,7 +31,6 @@ from train.evaluate import evaluate, make_vector_env
 from train.learn import Training
 from train.mixed_env import MixedVectorEnv, threads_of_each
 from train.progress import read_progress
-from train.residual_env import ResidualVectorWrapper
 from train.sb3_env import SB3VecEnv
 from train.scores import played_together
 from train.state import capture, read_state, restore, write_state

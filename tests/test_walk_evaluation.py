@@ -15,6 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 import train.compare
+from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking_controller import LocalFrame, local_frame
 from elastic_env.config import load_yaml
 from elastic_env.robots.robot_model import WalkerModel
@@ -27,7 +28,6 @@ from train.conditions import Condition, PolicySpec
 from train.contenders import RawWorlds, VectorLoop
 from train.evaluate import Evaluation, evaluate, make_vector_env
 from train.figures import figure_name, option_curves, reference_curves
-from train.residual_env import ResidualVectorWrapper
 from train.summary import failure_notes, print_summary, summary_table, write_summary
 from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.sweep_plots import draw_sweep

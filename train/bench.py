@@ -32,7 +32,7 @@ class BenchCase(Model):
 
     env: str
     policy: Locator
-    """A baseline, residual:PATH, or "module:function"."""
+    """A baseline, residual:PATH, "FILE.py:function" or "module:function"."""
     scenario: Title = "nominal"
     reference: Motion | None = None
     """Motion, as in a comparison; None for the environment's default."""

@@ -41,7 +41,7 @@ Motion = Annotated[Any, AfterValidator(_reference)]
 
 
 class PolicySpec(Model):
-    """A policy of a comparison: a baseline's name, or "module:function" for one's own, with options."""
+    """A policy of a comparison: a baseline's name, or "FILE.py:function" for one's own, with options."""
 
     name: Locator
     label: Locator | None = None

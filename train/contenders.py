@@ -216,7 +216,7 @@ class PPOLoop:
         from stable_baselines3 import PPO
         from stable_baselines3.common.vec_env import SubprocVecEnv
 
-        from train.residual_env import ResidualVectorWrapper
+        from baselines.residual_env import ResidualVectorWrapper
         from train.sb3_env import SB3VecEnv
 
         where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
@@ -270,7 +270,7 @@ class _Maker:
         made = _make(self._env)
         if self._policy is None:
             return made
-        from train.residual_env import ResidualWrapper
+        from baselines.residual_env import ResidualWrapper
 
         return ResidualWrapper(made, self._policy, space=self._space)  # type: ignore[arg-type]
 

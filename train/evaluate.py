@@ -1,6 +1,5 @@
 """Run a policy in an environment, many episodes at once; keep its metrics, one time series, and the static points."""
 
-import importlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +16,7 @@ from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array, BoolArray
 from train.conditions import Condition, PolicySpec
 from train.support_changes import SupportChanges
+from train.user_code import named_object
 
 _MAX_WORLDS = 64
 _BEFORE_FALL_S = 0.6
@@ -79,13 +79,11 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
     options = spec.options if options is None else options
     if ":" not in spec.name or spec.name.startswith(baselines.RESIDUAL):
         return baselines.make(spec.name, env, **options)
-    module, _, attribute = spec.name.partition(":")
-    if not module or module.startswith("."):
-        raise _not_a_policy(spec, "the module must have its full name")
     try:
-        function = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
-        raise _not_a_policy(spec, str(error)) from None
+        function = named_object(spec.name)
+    except ConfigurationError as error:
+        raise _not_a_policy(spec, str(error)) from error
+    attribute = spec.name.rpartition(":")[2]
     if not callable(function):
         raise _not_a_policy(spec, f"{attribute} is no function but of type {type(function).__name__}")
     try:
@@ -100,7 +98,8 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
 def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
     return ConfigurationError(
         f"policy {spec.name!r}: {problem}; give a baseline ({', '.join(baselines.policy_names())}) or "
-        '"module:function", a function that takes the environment and returns an object with predict()'
+        '"FILE.py:function" or "module:function", a function that takes the environment and returns an object with '
+        "predict()"
     )
 
 

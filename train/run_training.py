@@ -10,7 +10,7 @@ from elastic_env.config import load_yaml
 from elastic_env.errors import ConfigurationError
 from train.environments import environment
 from train.progress import read_progress
-from train.runs import run_folder
+from train.runs import locked, run_folder
 from train.train_config import CONSTANTS, TrainConfig
 from train.trainer import Trainer
 from train.workers import show_progress, side_by_side
@@ -34,7 +34,7 @@ def start(config: TrainConfig, console: Console, output: Path | None = None, job
         ConfigurationError: Names or options that do not exist.
         ResultsExistError: The output folder holds results.
     """
-    with run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], output) as folder:
+    with run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], output) as folder, locked(folder):
         return _train(config, folder, console, jobs)
 
 
@@ -42,13 +42,14 @@ def resume(folder: Path, console: Console, jobs: int = 1) -> Path:
     """Go on with a run that was interrupted or killed; seeds that are complete stay as they are.
 
     Raises:
-        ConfigurationError: The folder is no training run.
+        ConfigurationError: The folder is no training run, or another program works on it.
     """
     if not (folder / _CONFIG).is_file():
         raise ConfigurationError(
             f"{folder} is no training run: it has no {_CONFIG}; name the folder that train printed"
         )
-    return _train(load_yaml(folder / _CONFIG, TrainConfig), folder, console, jobs)
+    with locked(folder):
+        return _train(load_yaml(folder / _CONFIG, TrainConfig), folder, console, jobs)
 
 
 def _train(config: TrainConfig, folder: Path, console: Console, jobs: int) -> Path:

@@ -1,6 +1,10 @@
 """Result folders: never overwritten, each with the configuration, seed, versions and commit that made it."""
 
+import contextlib
+import fcntl
+import itertools
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Iterator
@@ -12,11 +16,12 @@ from typing import Any
 
 import yaml
 
-from elastic_env.errors import ResultsExistError
+from elastic_env.errors import ConfigurationError, ResultsExistError, SystemFailedError
 
 RUNS = Path("runs")
 """Where results go unless a folder is named."""
 
+_LOCK = ".lock"
 _PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
 
 
@@ -36,19 +41,65 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
         ResultsExistError: The named output folder is not empty.
     """
     folder = free_folder(name, output)
-    folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True))
     (folder / "metadata.json").write_text(json.dumps(provenance(seed), indent=2) + "\n")
     return folder
 
 
 def free_folder(name: str, output: Path | None = None) -> Path:
-    """A folder to write results to: the one that is named, or runs/<name>, numbered if taken.
+    """A folder of one's own to write results to: the one that is named, or runs/<name>, numbered if taken.
+
+    It is made in one step, so that of several programs each gets another one.
 
     Raises:
+        ConfigurationError: The name is no name of a folder.
         ResultsExistError: The named folder is not empty.
+        SystemFailedError: The folder cannot be made.
     """
-    return _next_free(RUNS / name) if output is None else _empty(output)
+    try:
+        return _next_free(require_name(name)) if output is None else _empty(output)
+    except OSError as error:
+        place = RUNS if output is None else output
+        what = f"{error.filename or place}: {error.strerror or error}"
+        raise SystemFailedError(
+            f"no folder for results can be made at {place} ({what}); name one by --output"
+        ) from None
+
+
+def require_name(name: str) -> str:
+    """A name that is one folder's name and leads nowhere else.
+
+    Raises:
+        ConfigurationError: It is not.
+    """
+    if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
+        raise ConfigurationError(
+            f"name must be the name of a folder in {RUNS}, without / and not . or .., got {name!r}; to write "
+            "elsewhere, name a folder by --output"
+        )
+    return name
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other programs from a run for as long as this one works on it; a kill frees it.
+
+    Raises:
+        ConfigurationError: Another program works on it.
+    """
+    with (folder / _LOCK).open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            raise ConfigurationError(
+                f"another program, process {file.read().strip() or 'unknown'}, works on {folder}; wait until it has "
+                "ended, or end it"
+            ) from None
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield
 
 
 @contextmanager
@@ -64,20 +115,23 @@ def run_folder(
     try:
         yield folder
     except BaseException:
-        if set(folder.iterdir()) == described:
-            for file in described:
-                file.unlink()
+        made = described | {folder / _LOCK}
+        if set(folder.iterdir()) <= made:
+            for file in made:
+                file.unlink(missing_ok=True)
             folder.rmdir()
         raise
 
 
-def _next_free(folder: Path) -> Path:
-    if not _holds_results(folder):
-        return folder
-    number = 2
-    while _holds_results(candidate := folder.with_name(f"{folder.name}-{number}")):
-        number += 1
-    return candidate
+def _next_free(name: str) -> Path:
+    """runs/<name>, or the first of its numbers that nobody has taken; `mkdir` makes it for one program alone."""
+    RUNS.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        folder = RUNS / (name if number == 1 else f"{name}-{number}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise AssertionError
 
 
 def _empty(folder: Path) -> Path:
@@ -88,6 +142,7 @@ def _empty(folder: Path) -> Path:
             f"{folder} already holds results ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), "
             "which are never overwritten; name another folder, or leave --output out"
         )
+    folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 

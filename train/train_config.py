@@ -9,13 +9,13 @@ from pydantic import Field, field_validator, model_validator
 import baselines
 from baselines.correction import ResidualSettings
 from baselines.residual import ResidualDescription, require_plain_base
+from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.errors import ConfigurationError, shown
 from train.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
 from train.environments import environment
 from train.kinds import is_a
 from train.mixed_env import mixed_env
-from train.residual_env import ResidualVectorWrapper
 
 FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
 """Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""

@@ -46,7 +46,7 @@ class Speed:
     env: str = "walker"
     """Environment: testbed or walker."""
     policy: str | None = None
-    """Baseline in the loop, or "module:function"; default input_wrench on the walker, input on the testbed."""
+    """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the testbed."""
     num_envs: list[int] = field(default_factory=lambda: [64, 256])
     """Numbers of worlds."""
     others: bool = True

@@ -66,7 +66,7 @@ class Run:
     """
 
     policy: str = "uncompensated"
-    """Baseline, residual:PATH, or "module:function" for one's own."""
+    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own."""
     reference: str | None = None
     """Motion, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
     output: Path | None = None

@@ -67,7 +67,7 @@ class Evaluate:
     """
 
     policy: str = "input"
-    """Baseline, residual:PATH, or "module:function" for one's own. Baselines are
+    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own. Baselines are
     zero, uncompensated, input, dynamic, oracle; on the walker also
     uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
@@ -160,7 +160,7 @@ class Play:
     """
 
     policy: str = "uncompensated"
-    """Baseline, residual:PATH, or "module:function" for one's own; see elastic evaluate --help."""
+    """Baseline, residual:PATH, or "FILE.py:function" for one's own; see elastic evaluate --help."""
     env: str = "testbed"
     """Environment: testbed or walker."""
     scenario: str = DEFAULT_SCENARIO

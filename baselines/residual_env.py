@@ -13,9 +13,9 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-import baselines
 from baselines.correction import Corrected, ResidualSettings, Space
 from baselines.features import Features
+from baselines.policies import make
 from baselines.policy import Policy
 from elastic_env.errors import ActionError, ConfigurationError
 from elastic_env.signals import Array, BoolArray
@@ -27,7 +27,7 @@ class _Deciding:
     def __init__(self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int) -> None:
         if not hasattr(env.unwrapped, "assumed_model"):
             raise ConfigurationError(f"a residual needs an environment of ours, got {type(env.unwrapped).__name__}")
-        policy = baselines.make(base, env) if isinstance(base, str) else base
+        policy = make(base, env) if isinstance(base, str) else base
         self.settings = settings
         self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
         self.features = Features(self.corrected)

@@ -1,0 +1,83 @@
+"""Folders of results: each for one program alone, and none elsewhere than where it should be."""
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from elastic_env.errors import ConfigurationError, SystemFailedError
+from train.runs import free_folder, locked, new_run
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_programs_that_begin_at_the_same_moment_get_a_folder_each() -> None:
+    """Catches a free name that is looked up first and taken later."""
+    barrier, found = threading.Barrier(30), list[Path]()
+
+    def begin() -> None:
+        barrier.wait()
+        found.append(free_folder("x"))
+
+    threads = [threading.Thread(target=begin) for _ in range(30)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(set(found)) == 30
+    assert all(folder.is_dir() for folder in found)
+
+
+@pytest.mark.parametrize("name", ["../../elsewhere", "/tmp/elsewhere", "..", ".", "", "a/b", "a\\b", "a\0b"])
+def test_a_name_leads_nowhere_else(name: str, tmp_path: Path) -> None:
+    """Catches a configuration that writes outside of runs."""
+    with pytest.raises(ConfigurationError, match="name must be the name of a folder in runs"):
+        new_run(name, {}, 0)
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("obstacle", ["file", "dangling link"])
+def test_what_is_in_the_way_is_said(obstacle: str, tmp_path: Path) -> None:
+    """Catches a traceback where runs is a file or a link to nowhere."""
+    runs = tmp_path / "runs"
+    if obstacle == "file":
+        runs.write_text("")
+    else:
+        runs.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(SystemFailedError, match="no folder for results can be made at runs"):
+        free_folder("x")
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from train.runs import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -> None:
+    """Catches two --resume of one run at once, and a lock that outlives its program."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        cwd=Path(__file__).parents[1],
+    ) as other:  # fmt: skip
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with (
+            pytest.raises(ConfigurationError, match=f"another program, process {other.pid}, works on"),
+            locked(tmp_path),
+        ):
+            pass
+        other.kill()
+        other.wait()
+        with locked(tmp_path):
+            assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
