@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 import yaml
 
-from train.bench import BenchConfig
+from elastic_env.config import load_yaml
+from elastic_env.errors import ConfigurationError
+from train.bench import BenchConfig, configuration
 from train.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -25,7 +27,7 @@ def written(**case: Any) -> Path:
     """A configuration of one rollout."""
     path = Path("bench.yaml")
     content = {"env": "testbed", "policy": "input", "reference": QUICK, "figures": {"link_error_rms_rad": None}, **case}
-    path.write_text(yaml.safe_dump({"cases": [content]}))
+    path.write_text(f"# mine\n{yaml.safe_dump({'cases': [content]})}  # the end\n")
     return path
 
 
@@ -47,9 +49,10 @@ def test_what_was_accepted_is_kept_and_what_got_worse_falls_short(
     path = written()
     assert failed([str(path)])
     assert "nothing was accepted yet; elastic bench --update" in capsys.readouterr().out
+    before = path.read_text()
     assert not failed([str(path), "--update"])
     accepted = yaml.safe_load(path.read_text())["cases"][0]["figures"]["link_error_rms_rad"]
-    assert path.read_text().startswith("# What `elastic bench` guards")
+    assert path.read_text() == before.replace("null", f"{accepted:.4g}")  # comments and order stay
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", "summary.md")
     assert not failed([str(path)])
     (figure,) = json.loads(Path("runs/bench-3/bench.json").read_text())
@@ -83,3 +86,13 @@ def test_the_shipped_configuration_is_accepted_in_full() -> None:
     config = BenchConfig.model_validate(yaml.safe_load((ROOT / "configs" / "bench.yaml").read_text()))
     assert all(value is not None for case in config.cases for value in case.figures.values())
     assert {case.env for case in config.cases} == {"testbed", "walker"}
+
+
+def test_the_package_has_its_own_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a bench that works in a checkout alone, and one that would change the installed package."""
+    shipped = configuration(Path("configs/bench.yaml"))
+    assert load_yaml(shipped, BenchConfig).cases
+    assert shipped.resolve() == (ROOT / "configs" / "bench.yaml").resolve()
+    with pytest.raises(ConfigurationError, match=r"copy .* there first"):
+        configuration(Path("configs/bench.yaml"), update=True)
+    assert configuration(Path("mine.yaml")) == Path("mine.yaml")

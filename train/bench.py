@@ -14,17 +14,18 @@ from rich.console import Console
 from rich.table import Table
 
 from elastic_env.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
+from elastic_env.errors import ConfigurationError
 from train.conditions import Condition, Motion, PolicySpec
 from train.environments import environment
+from train.escaping import markdown_table
 from train.evaluate import Evaluation
 from train.kinds import is_a
 from train.runs import run_folder
 from train.workers import run_conditions
 
-_HEADER = """\
-# What `elastic bench` guards: figures of short rollouts, each accepted up to the margin above it, and no falls.
-# `elastic bench --update` writes the figures anew.
-"""
+USUAL = Path("configs/bench.yaml")
+"""Where a configuration is looked for; in a checkout it is that of the package."""
+_SHIPPED = Path(__file__).with_name("bench.yaml")
 
 
 class BenchCase(Model):
@@ -84,7 +85,7 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
     """Play the rollouts of a configuration, write and print their figures.
 
     Args:
-        path: Configuration; with `update` it is written anew.
+        path: Configuration; with `update` its figures are changed.
         console: Where progress and results go.
         update: Accept what is measured now.
         output: Folder for bench.json and bench.md; default runs/bench, numbered if taken.
@@ -144,15 +145,42 @@ def _problem(metric: str, measured: float, bound: float | None, episode: dict[st
     return f"{metric} is {measured:.4g}, at most {bound:.4g} is accepted" if not measured <= bound else ""
 
 
+def configuration(path: Path, update: bool = False) -> Path:
+    """The configuration that is meant: where the usual one does not exist, that of the package.
+
+    Raises:
+        ConfigurationError: The one of the package is to be changed.
+    """
+    if path != USUAL or path.exists():
+        return path
+    if update:
+        raise ConfigurationError(f"there is no {USUAL} to update; copy {_SHIPPED} there first")
+    return _SHIPPED
+
+
 def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> None:
-    content = config.model_dump(mode="json", exclude_defaults=True)
-    for case, evaluation in zip(content["cases"], evaluations, strict=True):
+    """Write measured figures in the place of accepted ones; what stands around them stays."""
+    text = path.read_text(encoding="utf-8")
+    changes = []
+    for case, evaluation, figures in zip(config.cases, evaluations, _figure_nodes(text), strict=True):
         (episode,) = evaluation.episodes
-        if not episode["termination"]:
-            known = {metric: float(f"{episode[metric]:.4g}") for metric in case["figures"] if metric in episode}
-            case["figures"] |= known
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    path.write_text(_HEADER + text, encoding="utf-8")
+        for metric in case.figures:
+            if metric in episode and not episode["termination"]:
+                changes.append((figures[metric], f"{episode[metric]:.4g}"))
+    for node, value in sorted(changes, key=lambda change: -change[0].start_mark.index):
+        begin, end = node.start_mark.index, node.end_mark.index
+        text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
+    path.write_text(text, encoding="utf-8")
+
+
+def _figure_nodes(text: str) -> list[dict[str, yaml.Node]]:
+    """Where the figures of every case stand in a configuration, by metric."""
+    cases = _child(yaml.compose(text), "cases")
+    return [{key.value: value for key, value in _child(case, "figures").value} for case in cases.value]
+
+
+def _child(node: Any, name: str) -> Any:
+    return next(value for key, value in node.value if key.value == name)
 
 
 def _plain(figure: Figure) -> dict[str, Any]:
@@ -188,5 +216,5 @@ def _table(figures: list[Figure]) -> Table:
 
 
 def _markdown(figures: list[Figure]) -> str:
-    lines = ["## elastic bench", "", "| " + " | ".join(_COLUMNS) + " |", "|---|---|---:|---:|---:|---|"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in _rows(figures))]) + "\n"
+    rules = ["---", "---", "---:", "---:", "---:", "---"]
+    return f"## elastic bench\n\n{markdown_table(_COLUMNS, rules, _rows(figures))}\n"

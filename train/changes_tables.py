@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from train.changes import CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
+from train.escaping import csv_row
 from train.statistics import Estimate
 
 
@@ -21,7 +22,7 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([*_HEAD, *swept, *_FIGURES])
-        writer.writerows(records)
+        writer.writerows(map(csv_row, records))
     return path
 
 

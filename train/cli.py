@@ -86,10 +86,12 @@ def main(arguments: list[str] | None = None) -> None:
             command.run()
         except ElasticError as error:
             said = f"[bold red]error:[/] {escape(_with_notes(error))}"
-            Console(stderr=True).print(said, highlight=False, soft_wrap=True)
+            Console(stderr=True, emoji=False).print(said, highlight=False, soft_wrap=True)
             sys.exit(error.exit_code)
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-            Console(stderr=True).print(_with_notes(error, said), highlight=False, markup=False, soft_wrap=True)
+            Console(stderr=True, emoji=False).print(
+                _with_notes(error, said), highlight=False, markup=False, soft_wrap=True
+            )
             os._exit(128 + number)  # worker processes must not keep the terminal waiting

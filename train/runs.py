@@ -103,6 +103,19 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
+def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
+    """`free_folder` for the work within; it goes again if that fails without having written anything."""
+    folder = free_folder(name, output)
+    try:
+        yield folder
+    except BaseException:
+        with contextlib.suppress(OSError):  # it holds something
+            folder.rmdir()
+            folder.parent.rmdir()
+        raise
+
+
+@contextmanager
 def run_folder(
     name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
 ) -> Iterator[Path]:

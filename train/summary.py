@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from train.environments import Column, Environment
+from train.escaping import csv_record, markdown_table, markdown_text
 from train.evaluate import Evaluation
 
 _ANY_WIDTH = 10_000
@@ -110,7 +111,7 @@ def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
-        writer.writerows(records)
+        writer.writerows(map(csv_record, records))
     return path
 
 
@@ -132,21 +133,21 @@ def _summarised(evaluations: Sequence[Evaluation]) -> list[str]:
         parts += [f"{title}:", _markdown(evaluations, columns)]
     notes = failure_notes(evaluations)
     if notes:
-        parts += ["Where all episodes failed:", "\n".join(f"* {note}" for note in notes)]
+        parts += ["Where all episodes failed:", "\n".join(f"* {markdown_text(note)}" for note in notes)]
     return parts
 
 
 def _markdown(evaluations: Sequence[Evaluation], columns: Sequence[Column]) -> str:
     swept, failure = _swept(evaluations), evaluations[0].condition.environment.failure
     header = ["reference", "scenario", "policy", *swept, *(column.label for column in columns), failure]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for e in evaluations:
-        cells = [
+    rows = [
+        [
             e.condition.reference_name, e.condition.scenario, e.condition.policy.title, *_swept_values(e, swept),
             *(median_and_worst(e, column) for column in columns), failures(e),
-        ]  # fmt: skip
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        ]
+        for e in evaluations
+    ]  # fmt: skip
+    return markdown_table(header, ["---"] * len(header), rows)
 
 
 def _legend(known: Environment, columns: Sequence[Column]) -> str:

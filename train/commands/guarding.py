@@ -19,17 +19,17 @@ class Bench:
     """
 
     config: Annotated[Path, tyro.conf.Positional] = Path("configs/bench.yaml")
-    """Configuration with rollouts and accepted figures."""
+    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml, that of the package."""
     update: bool = False
-    """Accept what is measured now, and write the configuration anew."""
+    """Accept what is measured now: the figures in the configuration change, and nothing else of it."""
     output: Path | None = None
     """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
 
     def run(self) -> None:
         """Play and compare."""
-        from train.bench import bench
+        from train.bench import bench, configuration
 
-        if not bench(self.config, CONSOLE, self.update, self.output):
+        if not bench(configuration(self.config, self.update), CONSOLE, self.update, self.output):
             sys.exit(1)
 
 

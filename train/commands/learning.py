@@ -83,9 +83,10 @@ class Export:
     def run(self) -> None:
         """Export."""
         from train.export import export_zip
-        from train.runs import free_folder
+        from train.runs import own_folder
         from train.train_config import TrainConfig
 
-        folder = free_folder(self.model.stem, self.output)
-        export_zip(self.model, load_yaml(self.config, TrainConfig), folder, self.normaliser, self.trust_pickle)
+        config = load_yaml(self.config, TrainConfig)
+        with own_folder(self.model.stem, self.output) as folder:
+            export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         CONSOLE.print(f"play it as residual:{folder}", soft_wrap=True)

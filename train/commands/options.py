@@ -13,7 +13,7 @@ from elastic_env.config_problems import ModelError, ParameterPath
 from elastic_env.errors import ConfigurationError
 from elastic_env.yaml_text import parse_yaml
 
-CONSOLE = Console()
+CONSOLE = Console(emoji=False)  # a policy of the user may be called mine:zero
 """Where the commands say what they do."""
 
 DEFAULT_SCENARIO = "nominal"

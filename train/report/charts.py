@@ -7,6 +7,7 @@ import numpy as np
 
 from train.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
 from train.environments import Column
+from train.escaping import chart_text
 from train.evaluate import Evaluation
 from train.report.parts import (
     INK,
@@ -69,10 +70,10 @@ def ladder(lines: Lines, reference: str) -> Chart:
         )  # fmt: skip
         layout[f"xaxis{axis}"]["ticktext"] = [f"{value:g}" for value in layout[f"xaxis{axis}"]["tickvals"]]
     layout["yaxis"] = axis_of(
-        range=[y - 0.3, -0.7], tickvals=places, ticktext=[shortened(r[1]) for r in rungs], showgrid=False
+        range=[y - 0.3, -0.7], tickvals=places, ticktext=[chart_text(shortened(r[1])) for r in rungs], showgrid=False
     )
     layout["annotations"] = [
-        note(0.0, place, f"<b>{scenario}</b>", xref="paper", yref="y", xanchor="right", xshift=-8)
+        note(0.0, place, f"<b>{chart_text(scenario)}</b>", xref="paper", yref="y", xanchor="right", xshift=-8)
         for place, scenario in headings
     ]
     layout["shapes"] = [
@@ -111,7 +112,7 @@ def forest(rows: Sequence[Change]) -> Chart:
                     "error_x": error_bars([row.relative.scaled(100.0) for _, row in chosen], VERDICTS[verdict]),
                     "marker": {"size": 9, "color": VERDICTS[verdict], "symbol": [_symbol(row) for _, row in chosen],
                                "line": {"width": 1.6, "color": VERDICTS[verdict]}},
-                    "hoverinfo": "text", "hovertext": [f"{row.scope}: {row.sentence}" for _, row in chosen],
+                    "hoverinfo": "text", "hovertext": [chart_text(f"{row.scope}: {row.sentence}") for _, row in chosen],
                 }
             )  # fmt: skip
         data.append(
@@ -144,7 +145,7 @@ def _rungs(title: str, colour: str, symbol: str, places: Sequence[float], estima
     """Points of a policy with their intervals."""
     kept = [(y, e) for y, e in zip(places, estimates, strict=True) if np.isfinite(e.value)]
     return {
-        "type": "scatter", "mode": "markers", "name": title, "xaxis": f"x{axis}",
+        "type": "scatter", "mode": "markers", "name": chart_text(title), "xaxis": f"x{axis}",
         "x": [digits(e.value) for _, e in kept], "y": [y for y, _ in kept],
         "error_x": error_bars([e for _, e in kept], colour),
         "marker": {"size": 10, "color": colour, "symbol": symbol},
@@ -171,7 +172,7 @@ def _values(places: Sequence[float], estimates: Sequence[Estimate], cells: Seque
 
 
 def _scope_of(row: Change, with_reference: bool) -> str:
-    name = f"{row.reference} · {row.scope}" if with_reference else row.scope
+    name = chart_text(f"{row.reference} · {row.scope}" if with_reference else row.scope)
     return f"<b>{name}</b>" if row.is_group else name
 
 

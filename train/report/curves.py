@@ -6,6 +6,7 @@ import numpy as np
 
 from train.changes import level
 from train.environments import Column, Signal
+from train.escaping import chart_text
 from train.evaluate import Evaluation
 from train.plots import line_style
 from train.progress import Curves
@@ -105,7 +106,8 @@ def sweep(lines: Lines, points: Mapping[str, Mapping[float | None, list[Evaluati
         data += [_fall_marks(t, lines.colour[t], points[t], values, row, axis) for row, t in enumerate(failing)]
         layout[f"yaxis{axis}"] = axis_of(
             domain=[min(top + 0.02, 0.99), 1.0], tickvals=list(range(len(failing))), anchor="x",
-            ticktext=list(map(shortened, failing)), range=[len(failing) - 0.4, -0.6], showgrid=False,
+            ticktext=[chart_text(shortened(title)) for title in failing], range=[len(failing) - 0.4, -0.6],
+            showgrid=False,
         )  # fmt: skip
         layout["margin"]["l"] = max(76, 7.4 * min(max(map(len, failing)), LONGEST_NAME) + 20)
     layout["xaxis"] = axis_of(
@@ -132,7 +134,7 @@ def learning(curves: Mapping[str, Curves], columns: Sequence[Column], colour: Ma
             x = [int(value) for value in found.decisions]
             if len(ratio) > 1:
                 data += band_between(low, high, colour[title], {**where, "x": x}, title)
-            data.append({**where, "mode": "lines+markers", "x": x, "y": numbers(middle), "name": title,
+            data.append({**where, "mode": "lines+markers", "x": x, "y": numbers(middle), "name": chart_text(title),
                          "legendgroup": title, "showlegend": number == 0, "marker": {"size": 6},
                          "line": {"color": colour[title], "width": 2}})  # fmt: skip
         layout[f"xaxis{axis}"] = axis_of(title="decisions of all worlds", domain=domain(number, len(columns), 0.08),
@@ -158,7 +160,7 @@ def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: Signal,
         row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
     low, middle, high = band(padded[:, ::stride])
     dash = "dash" if line_style(title) == "--" else "solid"
-    line = {**where, "y": numbers(middle), "name": title, "legendgroup": title, "showlegend": first,
+    line = {**where, "y": numbers(middle), "name": chart_text(title), "legendgroup": title, "showlegend": first,
             "line": {"color": colour, "width": 1.5, "dash": dash}}  # fmt: skip
     if len(cell) < 2:
         return [line]
@@ -169,7 +171,7 @@ def _sweep_lines(title: str, colour: str, own: Mapping[float | None, list[Evalua
                  column: Column, axis: str, first: bool) -> list[Spec]:  # fmt: skip
     """A curve with its band, or a level."""
     where = {"type": "scatter", "yaxis": f"y{axis}", "legendgroup": title}
-    named = {"name": title, "showlegend": first}
+    named = {"name": chart_text(title), "showlegend": first}
     estimates = {value: level(cell, column).scaled(column.scale) for value, cell in own.items()}
     if None in own:
         y = numbers(np.full(2, estimates[None].value))
@@ -199,5 +201,5 @@ def _fall_marks(title: str, colour: str, own: Mapping[float | None, list[Evaluat
             symbols.append("x" if failed == played else "x-open")
     return {
         "type": "scatter", "mode": "markers", "x": x, "y": [row] * len(x), "yaxis": f"y{axis}", "showlegend": False,
-        "marker": {"symbol": symbols, "size": 9, "color": colour}, "hoverinfo": "skip", "name": title,
+        "marker": {"symbol": symbols, "size": 9, "color": colour}, "hoverinfo": "skip", "name": chart_text(title),
     }  # fmt: skip

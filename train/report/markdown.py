@@ -1,18 +1,22 @@
 """The tables and sentences of a report as Markdown."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from train.changes import Change, by_line, percent_interval
 from train.changes_tables import falls
+from train.escaping import markdown_table, markdown_text
 from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
 
 
 def markdown(results: Results) -> str:
     """A whole report."""
-    parts = [f"# Comparison: {results.name}", "\n".join(f"* {term}: {text}" for term, text in what(results))]
-    parts += ["## In short", "\n".join(f"* {line}" for line in in_short(results))]
+    parts = [
+        f"# Comparison: {markdown_text(results.name)}",
+        _bullets(f"{term}: {text}" for term, text in what(results)),
+    ]
+    parts += ["## In short", _bullets(in_short(results))]
     for title, rows in (
         ("Residuals against their base", [row for row in results.changes if row.is_family]),
         ("Baselines against one another", [row for row in results.changes if not row.is_family]),
@@ -24,8 +28,12 @@ def markdown(results: Results) -> str:
         parts += [f"## {title}", SCORES, _markdown_table(head, rows, words=3 + len(results.swept_options))]
     if results.learning:
         parts += ["## Learning curves", _learning_markdown(results)]
-    parts += ["## Notes", "\n".join(f"* {note}" for note in notes(results))]
+    parts += ["## Notes", _bullets(notes(results))]
     return "\n\n".join(parts) + "\n"
+
+
+def _bullets(lines: Iterable[str]) -> str:
+    return "\n".join(f"* {markdown_text(line)}" for line in lines)
 
 
 def _changes_markdown(rows: Sequence[Change], swept: Sequence[str]) -> str:
@@ -63,5 +71,4 @@ def _learning_markdown(results: Results) -> str:
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int, last_is_words: bool = False) -> str:
     last = len(head) - 1
     rules = ["---" if i < words or (last_is_words and i == last) else "---:" for i in range(len(head))]
-    lines = [head, rules, *([text.replace("|", "\\|") for text in row] for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(head, rules, rows)

@@ -1,6 +1,5 @@
 """The page of the report: style, script, tables and charts as HTML that needs nothing from outside."""
 
-import json
 from collections.abc import Mapping, Sequence
 from html import escape
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from train.changes import CEILING, Change, by_line, percent_interval
 from train.changes_tables import falls
+from train.escaping import script_json
 from train.report.parts import FONT, VERDICTS, Chart
 
 _STYLE = """
@@ -109,7 +109,7 @@ class Page:
         """A chart; one that is folded away under a title is drawn when it is opened."""
         self._charts += 1
         name = f"c{self._charts}"
-        spec = json.dumps(chart.spec, ensure_ascii=False, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+        spec = script_json(chart.spec)
         figure = (
             f'<figure><div class="chart" id="{name}" style="height:{chart.height}px"></div></figure>'
             f'<script type="application/json" id="{name}-spec">{spec}</script>'
