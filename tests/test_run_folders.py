@@ -7,8 +7,10 @@ import threading
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from elastic_env.errors import ConfigurationError, SystemFailedError
+from train.run_training import resume
 from train.runs import free_folder, locked, new_run
 
 
@@ -81,3 +83,13 @@ def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -
         other.wait()
         with locked(tmp_path):
             assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+
+
+def test_a_run_that_is_resumed_runs_no_code_of_its_folder(tmp_path: Path) -> None:
+    """Catches a folder from elsewhere whose algorithm lies beside its configuration."""
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nclass Algorithm: pass\n")
+    text = (Path(__file__).parents[1] / "configs" / "train_testbed.yaml").read_text()
+    (tmp_path / "config.yaml").write_text(f"algorithm: evil:Algorithm\n{text}")
+    with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code"):
+        resume(tmp_path, Console(quiet=True))
+    assert not (tmp_path / "ran").exists()

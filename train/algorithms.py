@@ -1,6 +1,5 @@
 """Learning algorithms by name."""
 
-import importlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -9,20 +8,20 @@ import stable_baselines3
 
 from elastic_env.errors import ConfigurationError, shown, unknown_name
 from train.train_config import CONSTANTS
+from train.user_code import named_object
 
 
 def algorithm_class(name: str) -> Any:
-    """Class of an algorithm: A2C, PPO or SAC of stable_baselines3, or "module:Class".
+    """Class of an algorithm: A2C, PPO or SAC of stable_baselines3, "module:Class" or "FILE.py:Class".
 
     Raises:
         ConfigurationError: It does not exist.
     """
     if ":" in name:
-        module, _, attribute = name.partition(":")
         try:
-            return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigurationError(f"algorithm {name!r}: {error}") from None
+            return named_object(name)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"algorithm {name!r}: {error}") from error
     known = ("A2C", "PPO", "SAC")
     if name not in known:
         raise unknown_name("algorithm", name, [*known, CONSTANTS, "module:Class"])

@@ -38,18 +38,30 @@ def start(config: TrainConfig, console: Console, output: Path | None = None, job
         return _train(config, folder, console, jobs)
 
 
-def resume(folder: Path, console: Console, jobs: int = 1) -> Path:
+def resume(folder: Path, console: Console, jobs: int = 1, trust_code: bool = False) -> Path:
     """Go on with a run that was interrupted or killed; seeds that are complete stay as they are.
 
+    Args:
+        folder: Of the run.
+        console: Where progress and results go.
+        jobs: Seeds at a time, 0 for one per core.
+        trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may lie in the folder.
+
     Raises:
-        ConfigurationError: The folder is no training run, or another program works on it.
+        ConfigurationError: The folder is no training run, another program works on it, or its algorithm is not trusted.
     """
     if not (folder / _CONFIG).is_file():
         raise ConfigurationError(
             f"{folder} is no training run: it has no {_CONFIG}; name the folder that train printed"
         )
+    config = load_yaml(folder / _CONFIG, TrainConfig)
+    if ":" in config.algorithm and not trust_code:
+        raise ConfigurationError(
+            f"{folder / _CONFIG} names an algorithm of its own, {config.algorithm!r}, whose code would run; look at "
+            "it, then say --trust-code"
+        )
     with locked(folder):
-        return _train(load_yaml(folder / _CONFIG, TrainConfig), folder, console, jobs)
+        return _train(config, folder, console, jobs)
 
 
 def _train(config: TrainConfig, folder: Path, console: Console, jobs: int) -> Path:

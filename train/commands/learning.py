@@ -30,6 +30,8 @@ class Train:
     """Decisions of all worlds together instead of the configuration's."""
     output: Path | None = None
     """Folder for the run, new or empty; default runs/<name>, numbered if taken."""
+    trust_code: bool = False
+    """With --resume: run the code that the run's algorithm names, where it is none of Stable-Baselines3's."""
     jobs: int = 1
     """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
 
@@ -53,7 +55,7 @@ class Train:
                 f"training needs {error.name}; install the extra: pip install 'elastic-env[train]'"
             ) from None
         if self.resume is not None:
-            folder = resume(self.resume, CONSOLE, self.jobs)
+            folder = resume(self.resume, CONSOLE, self.jobs, self.trust_code)
         else:
             config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
             with options_named():
