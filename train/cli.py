@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,11 +16,11 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from elastic_env.errors import ElasticError
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Train
 from train.commands.playing import Compare, Demo, Evaluate, Identify, Play
+from train.failures import DEFECT, explained
 
 Command = (
     Annotated[Identify, tyro.conf.subcommand("identify")]
@@ -38,6 +39,17 @@ Command = (
 def _with_notes(error: BaseException, said: str | None = None) -> str:
     """What an error says, and what was noted on its way here."""
     return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
+
+
+def _told(error: Exception) -> int:
+    """Say what failed; the exit code."""
+    found = explained(error)
+    if found is None:
+        traceback.print_exception(error)
+    said, code = found or (f"this is a defect of elastic-env, please report it: {type(error).__name__}", DEFECT)
+    line = f"[bold red]error:[/] {escape(_with_notes(error, said))}"
+    Console(stderr=True, emoji=False).print(line, highlight=False, soft_wrap=True)
+    return code
 
 
 class _EndedError(KeyboardInterrupt):
@@ -84,10 +96,10 @@ def main(arguments: list[str] | None = None) -> None:
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
             command.run()
-        except ElasticError as error:
-            said = f"[bold red]error:[/] {escape(_with_notes(error))}"
-            Console(stderr=True, emoji=False).print(said, highlight=False, soft_wrap=True)
-            sys.exit(error.exit_code)
+        except BrokenPipeError:
+            raise  # nobody reads any more: not worth a word
+        except Exception as error:
+            sys.exit(_told(error))
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"

@@ -22,7 +22,7 @@ from train.kinds import is_a
 from train.report import Results, require_plotly, write_report
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
-from train.workers import run_conditions
+from train.workers import CellsFailedError, run_conditions
 
 _MOST_CELLS = 10_000
 _MOST_JOBS = 1024
@@ -198,7 +198,14 @@ def compare(
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
     with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:
-        evaluations = run_conditions(conditions, console, jobs)
+        try:
+            evaluations = run_conditions(conditions, console, jobs)
+        except CellsFailedError as error:
+            if error.finished:
+                write_summary(merged(error.finished), folder / "summary.md")
+                kept = write_episodes(error.finished, folder / "episodes.csv")
+                console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
+            raise
         files = [write_episodes(evaluations, folder / "episodes.csv")]
         cells = merged(evaluations)
         files.append(write_summary(cells, folder / "summary.md"))

@@ -1,6 +1,7 @@
 """Run a policy in an environment, many episodes at once; keep its metrics, one time series, and the static points."""
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.static_points import HoldRecorder, StaticPoints
-from elastic_env.errors import ConfigurationError, ElasticError
+from elastic_env.errors import ConfigurationError, ElasticError, SystemFailedError
 from elastic_env.robots.robot_model import WalkerModel
 from elastic_env.signals import Array, BoolArray
 from train.conditions import Condition, PolicySpec
@@ -63,6 +64,10 @@ class Evaluation:
         """Samples of the trace that a figure's range goes by: all but those shortly before a fall."""
         time_s = self.trace["time_s"]
         return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
+
+
+class PolicyFailedError(ElasticError):
+    """A policy raised, or commanded what no action can be."""
 
 
 def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = None) -> Any:
@@ -187,10 +192,11 @@ def _play_in(
     while any(record is None for record in records):
         if keeper is not None and records[0] is None:
             keeper.take(observation, info)
-        action, state = policy.predict(observation, state=state, episode_start=episode_start, deterministic=True)
-        if estimates is not None:
-            estimates.take(step, policy.link_estimate(observation, state), observation, env.unwrapped.truth())
-        observation, _, terminated, truncated, info = env.step(action)
+        with _blamed(condition, step):
+            action, state = policy.predict(observation, state=state, episode_start=episode_start, deterministic=True)
+            if estimates is not None:
+                estimates.take(step, policy.link_estimate(observation, state), observation, env.unwrapped.truth())
+            observation, _, terminated, truncated, info = env.step(action)
         episode_start = np.zeros(worlds, dtype=np.bool_)
         for world in np.flatnonzero(terminated | truncated):
             if records[world] is None:
@@ -206,6 +212,25 @@ def _play_in(
     result.episodes.extend(record for record in records if record is not None)
     if keeper is not None:
         result.trace, result.points, result.rest_references = keeper.trace(), keeper.points(), keeper.references
+
+
+@contextmanager
+def _blamed(condition: Condition, step: int) -> Iterator[None]:
+    """Say of what a policy does within whose it is, and where.
+
+    Raises:
+        PolicyFailedError: It raises, or its action is none.
+    """
+    try:
+        yield
+    except (SystemFailedError, ConfigurationError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        kind = "" if isinstance(error, ElasticError) else f"{type(error).__name__}: "
+        raise PolicyFailedError(
+            f"the policy {condition.policy.title!r} failed in scenario {condition.scenario!r}, "
+            f"{condition.reference_name}, at control step {step}: {kind}{error}"
+        ) from error
 
 
 def _record(

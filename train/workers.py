@@ -16,15 +16,31 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from elastic_env.errors import ElasticError
 from train.conditions import Condition
-from train.evaluate import Evaluation, evaluate, num_steps
+from train.evaluate import Evaluation, PolicyFailedError, evaluate, num_steps
 
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
 
 
+class CellsFailedError(ElasticError):
+    """Policies failed in some conditions.
+
+    Attributes:
+        finished: Evaluations of the others.
+    """
+
+    def __init__(self, failed: Sequence[PolicyFailedError], finished: list[Evaluation]) -> None:
+        super().__init__("\n".join(dict.fromkeys(map(str, failed))))
+        self.finished = finished
+
+
 def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
+
+    Raises:
+        CellsFailedError: Policies failed in some of them; it has the results of the others.
 
     The results do not depend on the number of processes. On hardware the conditions come one after the other, in this
     process, at whose terminal somebody can agree to them.
@@ -45,7 +61,11 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
 
         results = side_by_side(_evaluate, [(conditions[number],) for number in longest_first], jobs, advance)
         show(0, sum(steps))
-    return [results[longest_first.index(number)] for number in range(len(conditions))]
+    played = [results[longest_first.index(number)] for number in range(len(conditions))]
+    failed = [result for result in played if isinstance(result, PolicyFailedError)]
+    if failed:
+        raise CellsFailedError(failed, [result for result in played if isinstance(result, Evaluation)])
+    return played
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
@@ -206,8 +226,12 @@ def _call(function: Callable[..., Any], given: tuple[Any, ...], number: int, rep
     return function(*given, lambda value: reports.put((number, value)))
 
 
-def _evaluate(condition: Condition, report: Callable[[int], None]) -> Evaluation:
-    return evaluate(condition, progress=report, num_threads=1)
+def _evaluate(condition: Condition, report: Callable[[int], None]) -> Evaluation | PolicyFailedError:
+    """An evaluation, or why there is none: the other conditions go on."""
+    try:
+        return evaluate(condition, progress=report, num_threads=1)
+    except PolicyFailedError as error:
+        return error.with_traceback(None)
 
 
 def _drain(reports: "queue.Queue[Any]") -> Iterator[Any]:

@@ -1,0 +1,133 @@
+"""What goes wrong with the system or with a user's policy is one sentence, and an exit code that says which."""
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import pytest
+
+from elastic_env.errors import ConfigurationError, SystemFailedError
+from train.failures import explained
+
+POLICIES = """
+import numpy as np
+class Policy:
+    def __init__(self, env, action):
+        self.shape, self.action = env.action_space.shape, action
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        step = 0 if state is None else state
+        return (np.zeros(self.shape, dtype=np.float32) if step < 3 else self.action(self.shape)), step + 1
+def raises(env):
+    return Policy(env, lambda shape: 1 / 0)
+def nan(env):
+    return Policy(env, lambda shape: np.full(shape, np.nan))
+def shape(env):
+    return Policy(env, lambda shape: np.zeros(7))
+"""
+COMPARISON = """
+name: cells
+env: testbed
+references: [{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}]
+policies: [input, "mine.py:raises"]
+"""
+
+
+def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from train.entry import main; main()", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "code"),
+    [
+        (ConfigurationError("no"), "no", 2),
+        (SystemFailedError("gone"), "gone", 3),
+        (OSError(errno.ENOSPC, "No space left on device", "runs/x"), "runs/x: No space left on device; free some", 3),
+        (BrokenProcessPool(), "a worker process was killed", 3),
+        (MemoryError(), "there is not enough memory", 3),
+        (ModuleNotFoundError("", name="torch"), "needs the package torch: install the extra train", 2),
+        (ModuleNotFoundError("", name="plotly.offline"), "install the extra report", 2),
+    ],
+)
+def test_a_failure_is_a_sentence_and_a_code(error: Exception, said: str, code: int) -> None:
+    found = explained(error)
+    assert found is not None
+    assert said in found[0]
+    assert found[1] == code
+
+
+def test_a_full_disk_is_found_behind_the_error_of_a_library() -> None:
+    """Catches a library that hides why it could not write."""
+    error, cause = RuntimeError("writer failed"), OSError(errno.ENOSPC, "No space left on device")
+    error.__cause__ = cause
+    assert explained(error) == explained(cause)
+    assert explained(RuntimeError("a defect")) is None
+
+
+@pytest.mark.parametrize("kind", ["raises", "nan", "shape"])
+def test_a_policy_that_fails_is_named_with_scenario_and_step(kind: str, tmp_path: Path) -> None:
+    """Catches a traceback, or words that leave open whose policy it was."""
+    (tmp_path / "mine.py").write_text(POLICIES)
+    reference = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
+    run = elastic("evaluate", "--policy", f"mine.py:{kind}", "--reference", reference, cwd=tmp_path)
+    assert run.returncode == 2, run.stderr
+    assert f"the policy 'mine.py:{kind}' failed in scenario 'nominal', sine, at control step 3" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_the_other_cells_of_a_comparison_are_kept(tmp_path: Path) -> None:
+    """Catches a comparison that loses what has been played because one policy fails."""
+    (tmp_path / "mine.py").write_text(POLICIES)
+    (tmp_path / "cells.yaml").write_text(COMPARISON)
+    run = elastic("compare", "cells.yaml", cwd=tmp_path)
+    assert run.returncode == 2, run.stderr
+    assert "ZeroDivisionError" in run.stderr
+    assert "the other 1 cells are in runs/cells/episodes.csv" in run.stdout
+    assert ",input,"[1:] in (tmp_path / "runs" / "cells" / "episodes.csv").read_text()
+
+
+def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
+    """Catches BrokenPipeError, also where the interpreter flushes at its end."""
+    code = f"{sys.executable} -c 'from train.entry import main; main()' evaluate --help"
+    run = subprocess.run(f"{code} | head -n 1", shell=True, capture_output=True, text=True, timeout=120, check=True)
+    assert "Traceback" not in run.stderr
+    assert "BrokenPipe" not in run.stderr
+
+
+def test_an_interrupt_while_modules_load_is_one_word() -> None:
+    """Catches a traceback through the imports."""
+    command = [sys.executable, "-c", "import sys; sys.argv[1:] = ['demo']; from train.entry import main; main()"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as program:
+        time.sleep(0.6)
+        program.send_signal(signal.SIGINT)
+        _, said = program.communicate(timeout=60)
+    assert said.splitlines()[-1].endswith("interrupted")
+    assert program.returncode == 130
+    assert "Traceback" not in said
+
+
+def limited(size: int) -> Callable[[], None]:
+    """In a child: no file may become larger [bytes], as on a disk that is full."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return limit
+
+
+@pytest.mark.parametrize("size", [0, 100, 2_000, 20_000])
+def test_a_file_that_cannot_grow_is_one_sentence(size: int, tmp_path: Path) -> None:
+    """Catches a traceback wherever a comparison writes, and a code that says "worse"."""
+    (tmp_path / "cells.yaml").write_text(COMPARISON.replace(', "mine.py:raises"', ""))
+    environment = {**os.environ, "MPLCONFIGDIR": str(tmp_path)}
+    run = elastic("compare", "cells.yaml", cwd=tmp_path, preexec_fn=limited(size), env=environment)
+    assert run.returncode == 3, run.stderr
+    assert "File too large" in run.stderr
+    assert "Traceback" not in run.stderr
