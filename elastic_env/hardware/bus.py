@@ -36,8 +36,6 @@ class States:
     """[rad/s]"""
     current: Array
     """Signed motor current [A]."""
-    temperature: Array
-    """[°C]"""
     is_fresh: BoolArray
     """Whether the servo answered this very request, whole and intact."""
     has_alert: BoolArray
@@ -260,13 +258,12 @@ class Bus:
         return self._states(block, replies, alerts)
 
     def _states(self, block: range, replies: Mapping[int, bytes], alerts: set[int]) -> States:
-        values = np.full((4, len(self.ids)), np.nan)
+        values = np.full((3, len(self.ids)), np.nan)
         for column, (servo_id, model) in enumerate(self.models.items()):
             if servo_id in replies:
                 values[0, column] = model.in_block("present_position", block, replies[servo_id]) * model.position_unit
                 values[1, column] = model.in_block("present_velocity", block, replies[servo_id]) * model.velocity_unit
                 values[2, column] = model.in_block("present_current", block, replies[servo_id]) * model.current_unit
-                values[3, column] = model.in_block("present_temperature", block, replies[servo_id])
         is_fresh = np.array([servo_id in replies for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
         return States(*values, is_fresh=is_fresh, has_alert=has_alert, time_s=time.monotonic())
@@ -356,7 +353,7 @@ class Buses:
         if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
             return self.buses[0].read_states(timeout_s)
         parts = self._on_each(lambda bus, _: bus.read_states(timeout_s))
-        names = ("position", "velocity", "current", "temperature", "is_fresh", "has_alert")
+        names = ("position", "velocity", "current", "is_fresh", "has_alert")
         joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
         return States(*joined, time_s=max(part.time_s for part in parts))
 

@@ -15,7 +15,7 @@ from elastic_env.errors import unknown_name
 from elastic_env.hardware.errors import HardwareError
 
 _RPM = 2.0 * math.pi / 60.0
-_BLOCK = ("present_position", "present_velocity", "present_current", "present_temperature")
+_BLOCK = ("present_position", "present_velocity", "present_current")
 NUM_BLOCKS = 24
 """Ways to read a servo's state; one is known as old for so many requests: 96 ms, over twice the longest patience."""
 

@@ -5,12 +5,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from elastic_env.hardware.attitude import Attitude, AttitudeStream, link_angle
+from elastic_env.hardware.attitude import AttitudeStream, link_angle
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
@@ -22,23 +22,6 @@ from elastic_env.signals import Array, BoolArray
 
 _SHORTEST_MOVE_S = 0.5
 _SETTLE_S = 0.5
-_FROZEN_SAMPLES, _FROZEN_RAD = 5, 0.03
-"""Equal attitudes in a row, and how far the servo may turn meanwhile [rad]: nearly three times twice F/K."""
-
-
-@dataclass(frozen=True)
-class Unchanged:
-    """An attitude of the IMU that stays the same: roll, pitch, yaw, and where the servo was when it came [rad].
-
-    Attributes:
-        time_s: When the last sample with it came.
-        samples: How many came after the first.
-    """
-
-    angles: tuple[float, float, float]
-    theta: float
-    time_s: float
-    samples: int
 
 
 @dataclass(frozen=True)
@@ -95,7 +78,6 @@ class ServoPlant:
         self._pace = Pace(period_s)
         self._goal = self._read_s = 0.0
         self._is_kept = False
-        self._unchanged: Unchanged | None = None
 
     def __del__(self) -> None:
         """A testbed that nobody holds any more gives its ports back."""
@@ -281,35 +263,15 @@ class ServoPlant:
         if self._imu is not None:
             sample = self._imu.latest()
             q = link_angle(sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
-            self._require_alive(sample)
             self._require_together(q, cycle.states.time_s - sample.time_s)
             self.qpos[0, at.q[0]] = q
-
-    def _require_alive(self, sample: Attitude) -> None:
-        """Refuse an IMU whose samples stay the same to the last bit while the motor turns: its filter is frozen.
-
-        A true one has noise. One without, emulated, follows the motor but for the friction of the link, which can hold
-        it for twice F/K.
-        """
-        theta, last = float(self.qpos[0, self._at.theta[0]]), self._unchanged
-        if last is None or (sample.roll, sample.pitch, sample.yaw) != last.angles:
-            self._unchanged = Unchanged((sample.roll, sample.pitch, sample.yaw), theta, sample.time_s, 0)
-            return
-        if sample.time_s > last.time_s:
-            self._unchanged = last = replace(last, time_s=sample.time_s, samples=last.samples + 1)
-        if last.samples >= _FROZEN_SAMPLES and not abs(theta - last.theta) <= _FROZEN_RAD:
-            raise HardwareError(
-                f"the IMU at {self.settings.imu_port} has shown the same attitude in {last.samples} samples while the "
-                f"servo turned by {theta - last.theta:+.3f} rad, {_FROZEN_RAD:g} rad are allowed: it is frozen, or "
-                "not on this link"
-            )
 
     def _require_together(self, q: float, age_s: float) -> None:
         """Refuse a link that is where no gear bends to; the motor has moved on since the IMU measured."""
         settings, at = self.settings, self._at
         apart = math.remainder(q - float(self.qpos[0, at.theta[0]]), 2.0 * math.pi)
         moved = abs(float(self.qvel[0, at.theta_dot[0]])) * max(age_s, 0.0)
-        if not abs(apart) <= settings.largest_deflection_rad + moved:  # nan stops it too
+        if abs(apart) > settings.largest_deflection_rad + moved:
             raise HardwareError(
                 f"the link, by the IMU at {settings.imu_port}, is {apart:+.2f} rad from the servo's angle, more than "
                 f"largest_deflection_rad {settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "

@@ -2,6 +2,7 @@
 
 import contextlib
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware import child
 from elastic_env.hardware.bus import Bus, Buses, States
 from elastic_env.hardware.channel import Channel
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
@@ -72,7 +72,7 @@ class SupervisedBus:
         own, other = Channel.pair()
         with other:
             self._process = subprocess.Popen(
-                child.command("elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports),
+                [sys.executable, "-m", "elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports],
                 pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
             )  # fmt: skip
         self._channel = Channel(own)
@@ -297,5 +297,5 @@ def _models(bus: Bus, ids: Sequence[int], said: list[str]) -> dict[int, int]:
 
 
 def _states(answer: dict[str, Any]) -> States:
-    names = ("position", "velocity", "current", "temperature", "is_fresh", "has_alert")
+    names = ("position", "velocity", "current", "is_fresh", "has_alert")
     return States(*(np.array(answer[name]) for name in names), time_s=float(answer["time_s"]))

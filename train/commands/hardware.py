@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -113,10 +113,6 @@ class Emulate:
     """Share of replies that end too early."""
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
-    imu_shows: Literal["truth", "nan", "infinite", "out of range", "frozen"] = "truth"
-    """What the IMU shows, always marked as valid."""
-    hot: bool = False
-    """The servos have 95 °C, and raise no alert."""
     seed: int = 0
     """Seed of noise and faults."""
 
@@ -129,7 +125,7 @@ class Emulate:
 
         faults = Faults(
             unheard=self.unheard, lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
-            latency_s=1e-3 * self.latency_ms, imu_shows=self.imu_shows, hot=self.hot,
+            latency_s=1e-3 * self.latency_ms,
         )  # fmt: skip
         config = EmulatorConfig(
             ids=tuple(self.ids), model_number=self.model_number, baudrate=self.baudrate, faults=faults, seed=self.seed,

@@ -1,6 +1,6 @@
 """What can go wrong on a bus, by switch: for trying out what a program does about it."""
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,16 +19,12 @@ class Faults(Model):
     latency_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of every reply: the adapter's latency timer")
     overload: bool = False
     """Whether the servos report an overload and let go."""
-    hot: bool = False
-    """Whether the servos have 95 °C, without an alert."""
     silent: bool = False
     """Whether the servos hear but do not answer."""
     unplugged: bool = False
     """Whether the port is gone."""
     imu_silent: bool = False
     """Whether the IMU sends nothing."""
-    imu_shows: Literal["truth", "nan", "infinite", "out of range", "frozen"] = "truth"
-    """What the IMU shows, always with its flag that says valid; a frozen one repeats its last attitude."""
     imu_corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of IMU packets with a flipped bit")
 
 

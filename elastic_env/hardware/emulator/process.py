@@ -35,8 +35,6 @@ _PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at 
 _SETTLE_S = 3e-4  # after a write, for the kernel to pass it on, which it does at a lower priority than ours
 _UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
-_SHOWN = {"nan": math.nan, "infinite": math.inf, "out of range": 4.0}
-"""What a failed IMU shows [rad], with its flag that says valid."""
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
@@ -108,7 +106,6 @@ class Emulator:
         self._bus = EmulatedBus(self._servos)
         self._parser = protocol.Parser()
         self._replies: deque[tuple[float, bytes]] = deque()
-        self._shown = 0.0
         self._next_imu_s = self._start_s = self._settled_s = time.monotonic()
 
     def step(self, wait_s: float, control: int | None = None) -> bool:
@@ -144,7 +141,6 @@ class Emulator:
         self.faults = changed(self.faults, changes)
         for servo in self._servos:
             servo.overload(self.faults.overload)
-            servo.heat(self.faults.hot)
         if self.faults.unplugged and self.bus_terminal is not None:
             self.bus_terminal.close()
             self.bus_terminal = None
@@ -220,8 +216,7 @@ class Emulator:
             return
         noise = self._imu.standard_normal(1)
         roll = attitude(self.config.testbed.scenario.imu, self._joints.q[:1], np.zeros(1), noise)
-        self._shown = _SHOWN.get(self.faults.imu_shows, self._shown if self.faults.imu_shows == "frozen" else roll[0])
-        sent = attitude_packet(float(self._shown), 0.0, 0.0, now - self._start_s)
+        sent = attitude_packet(float(roll[0]), 0.0, 0.0, now - self._start_s)
         if self._imu.random() < self.faults.imu_corrupted:
             sent = flip_bit(sent, self._imu)
         self.imu_terminal.write(sent)

@@ -8,7 +8,6 @@ from elastic_env.hardware import protocol
 from elastic_env.hardware.control_table import Register, ServoModel
 from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, current_of_torque
 
-_COOL_C, _HOT_C = 35, 95
 OVERLOAD = 1 << 5
 """Bit of an overload in the hardware error status."""
 
@@ -82,7 +81,7 @@ class EmulatedServo:
         current_limit, allowed_a = self.model.current_limit, current_of_torque(LARGEST_TORQUE_NM)
         self._set(current_limit, min(self._get(current_limit), int(allowed_a / self.model.current_unit)))
         self._set("present_input_voltage", 240)
-        self._set("present_temperature", _COOL_C)
+        self._set("present_temperature", 35)
 
     @property
     def is_on(self) -> bool:
@@ -116,10 +115,6 @@ class EmulatedServo:
         self._set("hardware_error_status", OVERLOAD if is_overloaded else 0)
         if is_overloaded and self.is_on:
             self._change("torque_enable", 0)
-
-    def heat(self, is_hot: bool) -> None:
-        """Become too hot without saying so by an alert, or cool again."""
-        self._set("present_temperature", _HOT_C if is_hot else _COOL_C)
 
     def watch(self, now_s: float) -> None:
         """Stop where it is if the bus has been silent for longer than the watchdog allows (models that have one).
