@@ -10,11 +10,11 @@ import mmap
 import os
 import struct
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from typing import Literal
 
+from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.port_lock import lock_port
 
@@ -114,8 +114,9 @@ class AttitudeStream:
         file = SharedSample.file()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)],
-                pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+                child_command("elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)),
+                env=child_environment(), pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE,
+                text=True, start_new_session=True,
             )  # fmt: skip
             return SharedSample(file)
         finally:

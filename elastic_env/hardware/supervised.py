@@ -2,7 +2,6 @@
 
 import contextlib
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ import numpy as np
 
 from elastic_env.hardware.bus import Bus, Buses, States
 from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
 from elastic_env.hardware.port import DEFAULT_BAUDRATE
 from elastic_env.hardware.protocol import require_ids
@@ -72,8 +72,8 @@ class SupervisedBus:
         own, other = Channel.pair()
         with other:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports],
-                pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
+                child_command("elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports),
+                env=child_environment(), pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
             )  # fmt: skip
         self._channel = Channel(own)
         self._number = 0
