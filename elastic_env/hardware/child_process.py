@@ -19,7 +19,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-_PATH = "PYTHONPATH"
+_PACKAGE, _PATH = "elastic_env", "PYTHONPATH"
 
 
 def child_command(module: str, *arguments: str) -> list[str]:
@@ -29,7 +29,7 @@ def child_command(module: str, *arguments: str) -> list[str]:
         module: Such as elastic_env.hardware.supervisor.
         *arguments: What it finds in `sys.argv`.
     """
-    names = dict.fromkeys((__package__.partition(".")[0], module.partition(".")[0]))
+    names = dict.fromkeys((_PACKAGE, module.partition(".")[0]))
     folders = os.pathsep.join(str(_folder(name)) for name in names)
     return [sys.executable, "-P", str(Path(__file__).resolve()), folders, module, *arguments]
 

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from elastic_env.config import Model, quantity
+from elastic_env.hardware.bounds import exceeds, is_outside
 from elastic_env.hardware.bus import States
 from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, torque_of_current
@@ -56,7 +57,7 @@ class Guard:
         self._missed: IntArray = np.zeros(len(measured), dtype=np.int64)
         self._strained: IntArray = np.zeros(len(measured), dtype=np.int64)
         # the margin is for what is measured on the way; where a motion begins is its first goal
-        outside = ~((limits.lowest_rad <= self.goals) & (self.goals <= limits.highest_rad))
+        outside = is_outside(self.goals, limits.lowest_rad, limits.highest_rad)
         if outside.any():
             raise FaultError(
                 f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad in the servos' "
@@ -80,11 +81,13 @@ class Guard:
             Goals within position and slew limits, and where they differ from what was asked for.
 
         Raises:
-            FaultError: A goal is not a finite number.
+            FaultError: A goal is not a finite number, or the time is none.
         """
         asked = np.asarray(goals, dtype=np.float64)
         if asked.shape != self.goals.shape or not np.isfinite(asked).all():
             raise FaultError(f"goals must be {len(self.goals)} finite angles [rad], got {np.asarray(goals).tolist()}")
+        if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
+            raise FaultError(f"the time since the last command must be at least 0 s and finite, got {elapsed_s} s")
         if self.is_holding:
             return self.goals.copy(), asked != self.goals
         limits = self.limits
@@ -96,9 +99,13 @@ class Guard:
     def take(self, states: States) -> str:
         """Take a cycle's replies; why the motion must stop, "" if it need not."""
         limits = self.limits
+        measured = np.stack([states.position, states.velocity, states.current])
+        unreal = states.is_fresh & ~np.isfinite(measured).all(axis=0)
+        if unreal.any():
+            return f"position, velocity or current of {self._which(unreal)} is not a finite number"
         self._missed = np.where(states.is_fresh, 0, self._missed + 1)
         torque = np.abs(torque_of_current(states.current))
-        strained = np.where(torque > limits.torque_nm, self._strained + 1, 0)
+        strained = np.where(exceeds(torque, limits.torque_nm), self._strained + 1, 0)
         self._strained = np.where(states.is_fresh, strained, self._strained)  # a missing reply tells neither way
         if states.has_alert.any():
             return "a servo reports a hardware error"
@@ -114,10 +121,10 @@ class Guard:
                 f"a position is outside {limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad: "
                 f"{self._which(outside, states.position)} rad"
             )
-        fast = states.is_fresh & (np.abs(states.velocity) > limits.speed_rad_s)
+        fast = states.is_fresh & exceeds(np.abs(states.velocity), limits.speed_rad_s)
         if fast.any():
             return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {self._which(fast, states.velocity)} rad/s"
-        behind = states.is_fresh & (np.abs(states.position - self.goals) > limits.following_error_rad)
+        behind = states.is_fresh & exceeds(np.abs(states.position - self.goals), limits.following_error_rad)
         if behind.any():
             return (
                 f"a servo is further than {limits.following_error_rad:g} rad from its goal, blocked or overloaded: "
@@ -135,4 +142,4 @@ class Guard:
 
     def _outside(self, positions: Array) -> BoolArray:
         low, high = self.limits.lowest_rad - self.limits.margin_rad, self.limits.highest_rad + self.limits.margin_rad
-        return (positions < low) | (positions > high)
+        return is_outside(positions, low, high)

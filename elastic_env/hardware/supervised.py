@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.hardware.bus import Bus, Buses, States
-from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.channel import LONGEST_WAIT_S, Channel
 from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
 from elastic_env.hardware.port import DEFAULT_BAUDRATE
@@ -163,7 +163,9 @@ class SupervisedBus:
                 self._exchanged(goals, time.monotonic() + _KEEP_ALIVE_S)
 
     def _exchanged(self, goals: Array, at: float) -> dict[str, Any]:
-        return self._ask("exchange", max(at - time.monotonic(), 0.0) + _ANSWER_S, goals=goals.tolist(), at=at)
+        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan as its second value
+        wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
+        return self._ask("exchange", wait_s + _ANSWER_S, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Torque off.

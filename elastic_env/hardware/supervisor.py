@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from elastic_env.hardware.bounds import exceeds
 from elastic_env.hardware.bus import Bus, Buses, States
-from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.channel import LONGEST_WAIT_S, Channel
 from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.control_table import explain_errors
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.realtime import Priority, prefer_realtime, sleep_until
 from elastic_env.hardware.safety import Guard, SafetyLimits
 
-_LONGEST_WAIT_S = 0.02
 _REPLY_TIMEOUT_S = 0.003
 _WATCHDOG_COUNTS = 3  # of 20 ms
 _WATCHDOG_CLEAR = 0
@@ -143,9 +143,9 @@ class Supervisor:
         """Command, wait for a moment, read; the moment is on the monotonic clock, which both processes share."""
         guard = self._require_motion()
         now = time.monotonic()
-        if at - now > _LONGEST_WAIT_S:
-            raise FaultError(f"a cycle may wait {_LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
-        allowed, is_limited = guard.command(np.array(goals), min(now - self._commanded_s, _LONGEST_WAIT_S))
+        if exceeds(at - now, LONGEST_WAIT_S):
+            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
+        allowed, is_limited = guard.command(np.array(goals), min(now - self._commanded_s, LONGEST_WAIT_S))
         was_holding = guard.is_holding
         self._bus.write_goals(allowed)
         self._commanded_s = now
@@ -229,7 +229,7 @@ def _require_healthy(bus: Bus, servo_id: int) -> None:
 
 def _require_rest(bus: Bus, servo_id: int) -> None:
     speed = abs(bus.velocity(servo_id))
-    if speed > _REST_RAD_S:
+    if exceeds(speed, _REST_RAD_S):
         raise FaultError(
             f"servo {servo_id} at {bus.name} moves at {speed:.2f} rad/s; torque goes on at rest, below {_REST_RAD_S:g} "
             "rad/s: wait until it hangs still, then try again"
