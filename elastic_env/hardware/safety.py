@@ -5,16 +5,19 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import model_validator
 
 from elastic_env.config import Model, quantity
 from elastic_env.hardware.bounds import exceeds, is_outside
-from elastic_env.hardware.bus import States
+from elastic_env.hardware.bus import TEMPERATURE_CYCLES, States
 from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, torque_of_current
 from elastic_env.signals import Array, BoolArray, IntArray
 
 _TURN = 2.0 * math.pi
+_LONGEST_UNTOLD = 2 * TEMPERATURE_CYCLES + 10
+"""Cycles without a servo's temperature that stop the motion; replies that are missing for longer do so before."""
 _TORQUE = "torque, by the current, that stops the motion"
 
 
@@ -26,6 +29,7 @@ class SafetyLimits(Model):
     slew_rad_s: float = quantity("rad/s", 3.0, gt=0, le=10, description="fastest change of the goal")
     speed_rad_s: float = quantity("rad/s", 4.5, gt=0, le=10, description="measured speed that stops the motion")
     torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, gt=0, le=LARGEST_TORQUE_NM, description=_TORQUE)
+    temperature_c: float = quantity("°C", 80.0, gt=0, le=80, description="temperature above which the motion stops")
     following_error_rad: float = quantity("rad", 0.35, gt=0, le=1.5, description="distance from the goal that stops it")
     margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5, description="how far beyond that range a position may lie")
     patience_cycles: int = quantity("1", 3, ge=1, le=10, description="cycles without a reply, or too much torque")
@@ -46,16 +50,21 @@ class Guard:
         measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead away from there as
             fast as the limits allow.
         names: How messages call the servos, (n,).
+        hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower one of each and the limit holds.
 
     Raises:
         FaultError: A position lies outside the goals' range, or is not known.
     """
 
-    def __init__(self, limits: SafetyLimits, measured: Array, names: Sequence[str]) -> None:
+    def __init__(
+        self, limits: SafetyLimits, measured: Array, names: Sequence[str], hottest: npt.ArrayLike = np.inf
+    ) -> None:
         self.limits, self._names = limits, tuple(names)
         self.goals = np.array(measured, dtype=np.float64)
         self._missed: IntArray = np.zeros(len(measured), dtype=np.int64)
         self._strained: IntArray = np.zeros(len(measured), dtype=np.int64)
+        self._untold: IntArray = np.zeros(len(measured), dtype=np.int64)
+        self._hottest: Array = np.minimum(np.full(len(measured), limits.temperature_c), hottest)
         # the margin is for what is measured on the way; where a motion begins is its first goal
         outside = is_outside(self.goals, limits.lowest_rad, limits.highest_rad)
         if outside.any():
@@ -133,6 +142,18 @@ class Guard:
         too_long = states.is_fresh & (self._strained >= limits.patience_cycles)
         if too_long.any():
             return f"the torque exceeds {limits.torque_nm:g} N·m: {self._which(too_long, torque)} N·m"
+        return self._heat(states.temperature)
+
+    def _heat(self, temperature: Array) -> str:
+        """Why the motion must stop by the temperatures that were told, or have not been for long; "" if it need not."""
+        untold = np.isnan(temperature)
+        self._untold = np.where(untold, self._untold + 1, 0)
+        hot = ~untold & exceeds(temperature, self._hottest)
+        if hot.any():
+            return too_hot(self._which(hot, temperature), self._hottest[hot])
+        unknown = exceeds(self._untold, _LONGEST_UNTOLD)
+        if unknown.any():
+            return f"no temperature from {self._which(unknown)} in {_LONGEST_UNTOLD} cycles: elastic hardware check"
         return ""
 
     def _which(self, are: BoolArray, values: Array | None = None) -> str:
@@ -143,3 +164,17 @@ class Guard:
     def _outside(self, positions: Array) -> BoolArray:
         low, high = self.limits.lowest_rad - self.limits.margin_rad, self.limits.highest_rad + self.limits.margin_rad
         return is_outside(positions, low, high)
+
+
+def too_hot(which: str, hottest: Array) -> str:
+    """Words for servos that are too hot.
+
+    Args:
+        which: Their names with their temperatures [°C].
+        hottest: What each may have, (n,) [°C].
+    """
+    allowed = ", ".join(f"{degrees:g}" for degrees in np.atleast_1d(hottest))
+    return (
+        f"too hot: {which} °C, at most {allowed} °C are allowed (temperature_c, or the servo's own temperature_limit); "
+        "let it cool, and look for what it has to hold or what blocks it"
+    )

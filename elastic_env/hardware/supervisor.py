@@ -26,7 +26,7 @@ from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.control_table import explain_errors
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.realtime import Priority, prefer_realtime, sleep_until
-from elastic_env.hardware.safety import Guard, SafetyLimits
+from elastic_env.hardware.safety import Guard, SafetyLimits, too_hot
 
 _REPLY_TIMEOUT_S = 0.003
 _WATCHDOG_COUNTS = 3  # of 20 ms
@@ -114,8 +114,10 @@ class Supervisor:
         for bus, servo_id in self._bus.servos:
             _require_healthy(bus, servo_id)
             _require_rest(bus, servo_id)
+        given = SafetyLimits(**limits)
+        hottest = np.array([_require_cool(bus, servo_id, given) for bus, servo_id in self._bus.servos])
         measured = np.array([bus.position(servo_id) for bus, servo_id in self._bus.servos])
-        guard = Guard(SafetyLimits(**limits), measured, self._bus.names)
+        guard = Guard(given, measured, self._bus.names, hottest)
         self._fault = None
         try:
             self._write("bus_watchdog", _WATCHDOG_CLEAR)
@@ -236,10 +238,20 @@ def _require_rest(bus: Bus, servo_id: int) -> None:
         )
 
 
+def _require_cool(bus: Bus, servo_id: int, limits: SafetyLimits) -> float:
+    """The temperature that a servo may have by the limits and its own setting [°C]; refuse one that is hotter."""
+    hottest = min(limits.temperature_c, float(bus.read(servo_id, "temperature_limit")))
+    degrees = bus.read(servo_id, "present_temperature")
+    if exceeds(degrees, hottest):
+        raise FaultError(too_hot(f"servo {servo_id} at {bus.name}: {degrees}", np.array(hottest)))
+    return hottest
+
+
 def _plain(states: States) -> dict[str, Any]:
     return {
         "position": states.position.tolist(), "velocity": states.velocity.tolist(), "current": states.current.tolist(),
         "is_fresh": states.is_fresh.tolist(), "has_alert": states.has_alert.tolist(), "time_s": states.time_s,
+        "temperature": states.temperature.tolist(),
     }  # fmt: skip
 
 

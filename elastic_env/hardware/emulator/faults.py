@@ -24,6 +24,8 @@ class Faults(Model):
     latency_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of every reply: the adapter's latency timer")
     overload: bool = False
     """Whether the servos report an overload and let go."""
+    hot: bool = False
+    """Whether the servos are at 95 °C, and report no error."""
     silent: bool = False
     """Whether the servos hear but do not answer."""
     unplugged: bool = False

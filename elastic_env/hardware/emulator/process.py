@@ -148,6 +148,7 @@ class Emulator:
         self.faults = changed(self.faults, changes)
         for servo in self._servos:
             servo.overload(self.faults.overload)
+            servo.heat(self.faults.hot)
         if self.faults.unplugged and self.bus_terminal is not None:
             self.bus_terminal.close()
             self.bus_terminal = None
