@@ -349,6 +349,15 @@ def supervisor_killed(share: float) -> Trial:
     return _ended("supervisor-killed", "SIGKILL of the supervisor: torque off within 100 ms", share, end)
 
 
+def supervisor_hangs(share: float) -> Trial:
+    """SIGSTOP of the supervisor: the program ends it and switches torque off in its place."""
+
+    def end(_: Any, supervisor: int) -> None:
+        os.kill(supervisor, signal.SIGSTOP)
+
+    return _ended("supervisor-hangs", "the supervisor hangs: torque off within 100 ms", share, end)
+
+
 def _kill(number: signal.Signals) -> Callable[[Any, int], None]:
     return lambda program, _: program.send_signal(number)
 
@@ -507,6 +516,7 @@ TRIALS: dict[str, Callable[[float], Trial]] = {
     "interrupted": interrupted,
     "supervisor-ended": supervisor_ended,
     "supervisor-killed": supervisor_killed,
+    "supervisor-hangs": supervisor_hangs,
     "unplugged": unplugged,
     "faults": faults,
     "loop": loop,

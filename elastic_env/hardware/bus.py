@@ -286,7 +286,8 @@ class Bus:
                     values[3, column] = model.in_block(_TEMPERATURE, block, replies[servo_id])
         is_fresh = np.array([servo_id in replies for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
-        return States(*values[:3], is_fresh=is_fresh, has_alert=has_alert, time_s=time.monotonic(), temperature=values[3])
+        now = time.monotonic()
+        return States(*values[:3], is_fresh=is_fresh, has_alert=has_alert, time_s=now, temperature=values[3])
 
     def _asked(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
         """The data of a reply; a few tries, with silence in between so that no late reply answers the next one."""

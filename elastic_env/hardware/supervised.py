@@ -27,6 +27,7 @@ _ANSWER_S = 0.1
 
 In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the other wait too.
 """
+_LEAST_ANSWER_S = 0.02
 _READ_S = 0.05
 _SLOW_S = 5.0
 _SLOW_PER_SERVO_S = 1.0
@@ -112,7 +113,7 @@ class SupervisedBus:
         self._is_enabled, self.is_confirmed_off = True, False
         given = limits or SafetyLimits()
         answer = self._ask("enable", self._slow_s, limits=given.model_dump())
-        self._answer_s = given.hang_s
+        self._answer_s = max(given.hang_s, _LEAST_ANSWER_S)
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
