@@ -26,8 +26,8 @@ class PlausibleAttitudes:
     """Looks at the attitudes that come, one after the other, for what cannot have been measured.
 
     An IMU marks as valid what its filter has computed, right or not. A filter that stands still goes on sending its
-    last angles. Those of a working one are never equal in all bits: the noise of its gyroscopes turns each of the
-    three by about 10 µrad from packet to packet, and a bit is 0.06 µrad at half a radian. So three angles that stay
+    last angles. Those of a working one should not be equal in all bits: a gyroscope of some 0.005 °/s/√Hz turns an
+    angle by about 10 µrad from packet to packet at 100 Hz, and a bit is at most 0.24 µrad. So three angles that stay
     the same are no newer than when they first came, and have the age at which any attitude counts as missing.
 
     Args:

@@ -225,7 +225,7 @@ class Emulator:
             return
         noise = self._imu.standard_normal(1)
         roll = attitude(self.config.testbed.scenario.imu, self._joints.q[:1], np.zeros(1), noise)
-        # a real IMU never sends the same angles twice; the roll is as good as the scenario says
+        # a real IMU should never send the same three angles twice; the roll is as good as the scenario says
         pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
         measured = math.remainder(float(roll[0]), 2.0 * math.pi), float(pitch), float(yaw)
         self._angles = distort(self.faults, measured, self._angles)
