@@ -45,10 +45,12 @@ class Line(Bus):
         gone_at: Instruction from which on the port is gone.
     """
 
-    def __init__(self, name: str, *ids: int, log: list[tuple[str, int]] | None = None) -> None:
+    def __init__(self, name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024) -> None:
         super().__init__(name)
         self.motors = {servo_id: MotorAtRest() for servo_id in ids}
-        self.servos = {i: EmulatedServo(i, MODEL, self._note, None, motor) for i, motor in self.motors.items()}
+        self.servos = {
+            i: EmulatedServo(i, servo_model(number), self._note, None, motor) for i, motor in self.motors.items()
+        }
         self.sent: list[tuple[int, int]] = []
         self.log = [] if log is None else log
         self.events: list[tuple[int, str, int]] = []
@@ -93,8 +95,8 @@ class Line(Bus):
         pass
 
 
-def attached(name: str, *ids: int, log: list[tuple[str, int]] | None = None) -> Line:
-    line = Line(name, *ids, log=log)
+def attached(name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024) -> Line:
+    line = Line(name, *ids, log=log, number=number)
     line.attach(ids)
     line.sent.clear()
     line.log.clear()

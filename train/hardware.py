@@ -3,7 +3,8 @@
 import contextlib
 import csv
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,12 +16,13 @@ from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.config import Model, load_yaml
-from elastic_env.errors import ConfigurationError
+from elastic_env.errors import ConfigurationError, unknown_name
 from elastic_env.hardware.attitude import AttitudeStream
 from elastic_env.hardware.bus import Bus
 from elastic_env.hardware.checks import Check, check_bus
 from elastic_env.hardware.control_table import servo_models
 from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.protocol import RATES, require_ids
 from elastic_env.hardware.settings import HardwareSettings
@@ -219,8 +221,29 @@ def _kept(path: Path, console: Console) -> Iterator[_Log]:
             raise
 
 
-def emulate(config: EmulatorConfig, console: Console) -> None:
-    """Emulate until Ctrl-C."""
+def require_switches(names: Sequence[str]) -> None:
+    """Check the names of faults that are there or not.
+
+    Raises:
+        ConfigurationError: There is no such one.
+    """
+    switches = [name for name, field in Faults.model_fields.items() if field.annotation is bool]
+    for name in names:
+        if name not in switches:
+            raise unknown_name("fault", name, switches)
+
+
+def emulate(
+    config: EmulatorConfig, console: Console, later: Mapping[str, bool] | None = None, after_s: float = 0.0
+) -> None:
+    """Emulate until Ctrl-C.
+
+    Args:
+        config: What is emulated.
+        console: Where the ports are said.
+        later: Faults that come after a while, see `Faults`.
+        after_s: When [s].
+    """
     with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
         console.print(f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True)
         console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
@@ -229,4 +252,8 @@ def emulate(config: EmulatorConfig, console: Console) -> None:
             f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
             soft_wrap=True,
         )
+        if later:
+            time.sleep(after_s)
+            emulator.faults(**later)
+            console.print(f"from now on: {', '.join(later)}", soft_wrap=True)
         emulator.wait()

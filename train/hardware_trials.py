@@ -5,7 +5,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +19,7 @@ import numpy as np
 import elastic_env  # noqa: F401  registers the environments
 from baselines.identification import identify
 from elastic_env.hardware.bus import Bus, States
+from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults
@@ -349,6 +349,15 @@ def supervisor_killed(share: float) -> Trial:
     return _ended("supervisor-killed", "SIGKILL of the supervisor: torque off within 100 ms", share, end)
 
 
+def supervisor_hangs(share: float) -> Trial:
+    """SIGSTOP of the supervisor: the program ends it and switches torque off in its place."""
+
+    def end(_: Any, supervisor: int) -> None:
+        os.kill(supervisor, signal.SIGSTOP)
+
+    return _ended("supervisor-hangs", "the supervisor hangs: torque off within 100 ms", share, end)
+
+
 def _kill(number: signal.Signals) -> Callable[[Any, int], None]:
     return lambda program, _: program.send_signal(number)
 
@@ -393,8 +402,8 @@ def _end_once(
     """Time from the end of the program to torque off [s]; None if the motion had ended before."""
     emulator.wait_until_rest()
     program = subprocess.Popen(
-        [sys.executable, "-m", "train.wave", emulator.port, "1"], stdout=subprocess.PIPE, text=True,
-        start_new_session=True,
+        child_command("train.wave", emulator.port, "1"), env=child_environment(), stdout=subprocess.PIPE,
+        text=True, start_new_session=True,
     )  # fmt: skip
     try:
         assert program.stdout is not None
@@ -507,6 +516,7 @@ TRIALS: dict[str, Callable[[float], Trial]] = {
     "interrupted": interrupted,
     "supervisor-ended": supervisor_ended,
     "supervisor-killed": supervisor_killed,
+    "supervisor-hangs": supervisor_hangs,
     "unplugged": unplugged,
     "faults": faults,
     "loop": loop,

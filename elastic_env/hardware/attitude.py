@@ -10,11 +10,11 @@ import mmap
 import os
 import struct
 import subprocess
-import sys
 import time
-from dataclasses import dataclass
-from typing import Literal
 
+from elastic_env.hardware.attitude_sample import Attitude, Axis, PlausibleAttitudes
+from elastic_env.hardware.bounds import is_outside
+from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.port_lock import lock_port
 
@@ -23,21 +23,9 @@ _SAMPLE = struct.Struct("=dddd")
 _SIZE = _COUNTER.size + _SAMPLE.size
 _TRIES = 100
 
-Axis = Literal["roll", "pitch", "yaw"]
-
 
 class AttitudeError(HardwareError):
-    """The IMU cannot be opened, sends nothing, or has stopped sending."""
-
-
-@dataclass(frozen=True)
-class Attitude:
-    """One sample: Euler angles of the maker's north-east-down convention [rad], and when it came in [s, monotonic]."""
-
-    time_s: float
-    roll: float
-    pitch: float
-    yaw: float
+    """The IMU cannot be opened, sends nothing or what it cannot have measured, or has stopped sending."""
 
 
 class SharedSample:
@@ -96,6 +84,7 @@ class AttitudeStream:
 
     def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0) -> None:
         self.port, self._oldest_s = port, oldest_s
+        self._plausible = PlausibleAttitudes(oldest_s)
         self._lock: int | None = lock_port(port)
         self._process: subprocess.Popen[str] | None = None
         try:
@@ -114,8 +103,9 @@ class AttitudeStream:
         file = SharedSample.file()
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)],
-                pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+                child_command("elastic_env.hardware.attitude_reader", str(file), port, str(baudrate)),
+                env=child_environment(), pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE,
+                text=True, start_new_session=True,
             )  # fmt: skip
             return SharedSample(file)
         finally:
@@ -129,11 +119,13 @@ class AttitudeStream:
         """The newest sample.
 
         Raises:
-            AttitudeError: It is too old: the stream has stopped.
+            AttitudeError: It is too old: the stream has stopped. Or no IMU that works can have measured it.
         """
         sample = self._shared.get()
-        if sample is None or time.monotonic() - sample.time_s > self._oldest_s:
+        if sample is None or is_outside(time.monotonic() - sample.time_s, 0.0, self._oldest_s):
             raise self._silent(sample)
+        if problem := self._plausible.problem(sample):
+            raise AttitudeError(f"the IMU at {self.port} {problem}")
         return sample
 
     def close(self) -> None:

@@ -2,13 +2,14 @@
 
 A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none of the last ones
 still awaits, so that a reply that comes late is known as old and left out, not taken for the present one's.
+Temperatures lie farther off, and change slowly: only every 25th request is for a block that reaches as far.
 """
 
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,12 @@ from elastic_env.hardware.errors import BusGoneError, HardwareError, ReplyError
 from elastic_env.hardware.port import COMM_SUCCESS, DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
 from elastic_env.signals import Array, BoolArray
 
+TEMPERATURE_CYCLES = 25
+"""Cycles from one reading of the temperatures to the next: 0.1 s at 250 Hz."""
+
 _TRIES = 3
 _QUIET_S = 0.03
+_TEMPERATURE = "present_temperature"
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,9 @@ class States:
     """Whether it reports a hardware error."""
     time_s: float
     """When the replies were in, on the monotonic clock."""
+    temperature: Array = field(default_factory=lambda: np.array(np.nan))
+    """[°C]; nan where this request was not for it, which nobody may take for cool. One nan for all of them if none is
+    given."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,7 @@ class Bus:
         self.models: dict[int, ServoModel] = {}
         self.num_retries = 0
         self._handler = PacketHandler()
+        self._untold = TEMPERATURE_CYCLES  # cycles since the last one in which all servos told their temperature
         self._awaited: deque[range | None] = deque(maxlen=NUM_BLOCKS - 1)  # by the last requests; None: all answered
 
     def open(self) -> None:
@@ -226,7 +235,7 @@ class Bus:
         return True
 
     def read_states(self, timeout_s: float) -> States:
-        """Position, velocity and current of all servos.
+        """Position, velocity and current of all servos, and now and then their temperature.
 
         Args:
             timeout_s: How long to wait for all replies together.
@@ -234,8 +243,7 @@ class Bus:
         Raises:
             BusGoneError: The port is gone.
         """
-        blocks = next(iter(self.models.values())).blocks
-        block = next(block for block in blocks if block not in self._awaited)
+        block = self._next_block()
         self._awaited.append(block)
         asked = block.start.to_bytes(2, "little") + len(block).to_bytes(2, "little")
         self._send(protocol.BROADCAST, protocol.SYNC_READ, asked + bytes(self.ids))
@@ -255,18 +263,31 @@ class Bus:
                 replies[servo_id] = data
         if len(replies) == len(self.ids):
             self._awaited[-1] = None
-        return self._states(block, replies, alerts)
+        states = self._states(block, replies, alerts)
+        self._untold = self._untold + 1 if np.isnan(states.temperature).any() else 0
+        return states
+
+    def _next_block(self) -> range:
+        """The shortest block that no reply is awaited for, with the temperature if that is due."""
+        model = next(iter(self.models.values()))
+        free = [block for block in model.blocks if block not in self._awaited]
+        if self._untold + 1 < TEMPERATURE_CYCLES:
+            return free[0]
+        return next((block for block in free if model.is_in_block(_TEMPERATURE, block)), free[0])
 
     def _states(self, block: range, replies: Mapping[int, bytes], alerts: set[int]) -> States:
-        values = np.full((3, len(self.ids)), np.nan)
+        values = np.full((4, len(self.ids)), np.nan)
         for column, (servo_id, model) in enumerate(self.models.items()):
             if servo_id in replies:
                 values[0, column] = model.in_block("present_position", block, replies[servo_id]) * model.position_unit
                 values[1, column] = model.in_block("present_velocity", block, replies[servo_id]) * model.velocity_unit
                 values[2, column] = model.in_block("present_current", block, replies[servo_id]) * model.current_unit
+                if model.is_in_block(_TEMPERATURE, block):
+                    values[3, column] = model.in_block(_TEMPERATURE, block, replies[servo_id])
         is_fresh = np.array([servo_id in replies for servo_id in self.ids])
         has_alert = np.array([servo_id in alerts for servo_id in self.ids])
-        return States(*values, is_fresh=is_fresh, has_alert=has_alert, time_s=time.monotonic())
+        now = time.monotonic()
+        return States(*values[:3], is_fresh=is_fresh, has_alert=has_alert, time_s=now, temperature=values[3])
 
     def _asked(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
         """The data of a reply; a few tries, with silence in between so that no late reply answers the next one."""
@@ -353,9 +374,9 @@ class Buses:
         if len(self.buses) == 1:  # nothing to join, in what a control cycle waits for
             return self.buses[0].read_states(timeout_s)
         parts = self._on_each(lambda bus, _: bus.read_states(timeout_s))
-        names = ("position", "velocity", "current", "is_fresh", "has_alert")
-        joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-        return States(*joined, time_s=max(part.time_s for part in parts))
+        names = ("position", "velocity", "current", "is_fresh", "has_alert", "temperature")
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return States(**joined, time_s=max(part.time_s for part in parts))
 
     def let_go(self, when_sent: Callable[[], None] = lambda: None) -> HardwareError | None:
         """Switch all torque off, at every bus before any servo is asked whether it is; a lost bus keeps no other on.

@@ -5,6 +5,9 @@ import select
 import socket
 from typing import Any
 
+LONGEST_WAIT_S = 0.02
+"""How far ahead a cycle may ask to be read [s]."""
+
 _LONGEST = 65536
 
 

@@ -122,6 +122,11 @@ class ServoModel:
         by_length = {end - start: range(start, end) for start in starts for end in ends}
         return tuple(by_length[length] for length in sorted(by_length)[:NUM_BLOCKS])
 
+    def is_in_block(self, name: str, block: range) -> bool:
+        """Whether a block holds a register, whole."""
+        register = self.table[name]
+        return block.start <= register.address and register.end <= block.stop
+
     def in_block(self, name: str, block: range, data: bytes) -> int:
         """Value of a register within the data of a block, [count]."""
         register = self.table[name]

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.hardware.attitude import AttitudeStream, link_angle
+from elastic_env.hardware.bounds import exceeds
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.settings import HardwareSettings
@@ -269,9 +270,11 @@ class ServoPlant:
     def _require_together(self, q: float, age_s: float) -> None:
         """Refuse a link that is where no gear bends to; the motor has moved on since the IMU measured."""
         settings, at = self.settings, self._at
-        apart = math.remainder(q - float(self.qpos[0, at.theta[0]]), 2.0 * math.pi)
+        apart = q - float(self.qpos[0, at.theta[0]])
+        if math.isfinite(apart):  # of others there is no remainder, and they are too far
+            apart = math.remainder(apart, 2.0 * math.pi)
         moved = abs(float(self.qvel[0, at.theta_dot[0]])) * max(age_s, 0.0)
-        if abs(apart) > settings.largest_deflection_rad + moved:
+        if exceeds(abs(apart), settings.largest_deflection_rad + moved):
             raise HardwareError(
                 f"the link, by the IMU at {settings.imu_port}, is {apart:+.2f} rad from the servo's angle, more than "
                 f"largest_deflection_rad {settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "

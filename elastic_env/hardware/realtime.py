@@ -6,6 +6,8 @@ import os
 import time
 from enum import IntEnum
 
+from elastic_env.hardware.bounds import exceeds
+
 
 class Priority(IntEnum):
     """Who goes before whom: what ends a motion before what moves, however busy that is."""
@@ -100,4 +102,4 @@ class Pace:
 
     def is_overrun(self, late_s: float) -> bool:
         """Whether a period was lost that was so late."""
-        return late_s > 0.5 * self._period_s
+        return bool(exceeds(late_s, 0.5 * self._period_s))

@@ -5,15 +5,19 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import model_validator
 
 from elastic_env.config import Model, quantity
-from elastic_env.hardware.bus import States
+from elastic_env.hardware.bounds import exceeds, is_outside
+from elastic_env.hardware.bus import TEMPERATURE_CYCLES, States
 from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, torque_of_current
 from elastic_env.signals import Array, BoolArray, IntArray
 
 _TURN = 2.0 * math.pi
+_LONGEST_UNTOLD = 2 * TEMPERATURE_CYCLES + 10
+"""Cycles without a servo's temperature that stop the motion; replies that are missing for longer do so before."""
 _TORQUE = "torque, by the current, that stops the motion"
 
 
@@ -25,6 +29,7 @@ class SafetyLimits(Model):
     slew_rad_s: float = quantity("rad/s", 3.0, gt=0, le=10, description="fastest change of the goal")
     speed_rad_s: float = quantity("rad/s", 4.5, gt=0, le=10, description="measured speed that stops the motion")
     torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, gt=0, le=LARGEST_TORQUE_NM, description=_TORQUE)
+    temperature_c: float = quantity("°C", 80.0, gt=0, le=80, description="temperature above which the motion stops")
     following_error_rad: float = quantity("rad", 0.35, gt=0, le=1.5, description="distance from the goal that stops it")
     margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5, description="how far beyond that range a position may lie")
     patience_cycles: int = quantity("1", 3, ge=1, le=10, description="cycles without a reply, or too much torque")
@@ -45,18 +50,23 @@ class Guard:
         measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead away from there as
             fast as the limits allow.
         names: How messages call the servos, (n,).
+        hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower one of each and the limit holds.
 
     Raises:
         FaultError: A position lies outside the goals' range, or is not known.
     """
 
-    def __init__(self, limits: SafetyLimits, measured: Array, names: Sequence[str]) -> None:
+    def __init__(
+        self, limits: SafetyLimits, measured: Array, names: Sequence[str], hottest: npt.ArrayLike = np.inf
+    ) -> None:
         self.limits, self._names = limits, tuple(names)
         self.goals = np.array(measured, dtype=np.float64)
         self._missed: IntArray = np.zeros(len(measured), dtype=np.int64)
         self._strained: IntArray = np.zeros(len(measured), dtype=np.int64)
+        self._untold: IntArray = np.zeros(len(measured), dtype=np.int64)
+        self._hottest: Array = np.minimum(np.full(len(measured), limits.temperature_c), hottest)
         # the margin is for what is measured on the way; where a motion begins is its first goal
-        outside = ~((limits.lowest_rad <= self.goals) & (self.goals <= limits.highest_rad))
+        outside = is_outside(self.goals, limits.lowest_rad, limits.highest_rad)
         if outside.any():
             raise FaultError(
                 f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad in the servos' "
@@ -80,11 +90,13 @@ class Guard:
             Goals within position and slew limits, and where they differ from what was asked for.
 
         Raises:
-            FaultError: A goal is not a finite number.
+            FaultError: A goal is not a finite number, or the time is none.
         """
         asked = np.asarray(goals, dtype=np.float64)
         if asked.shape != self.goals.shape or not np.isfinite(asked).all():
             raise FaultError(f"goals must be {len(self.goals)} finite angles [rad], got {np.asarray(goals).tolist()}")
+        if is_outside(elapsed_s, 0.0, np.finfo(np.float64).max):
+            raise FaultError(f"the time since the last command must be at least 0 s and finite, got {elapsed_s} s")
         if self.is_holding:
             return self.goals.copy(), asked != self.goals
         limits = self.limits
@@ -96,9 +108,13 @@ class Guard:
     def take(self, states: States) -> str:
         """Take a cycle's replies; why the motion must stop, "" if it need not."""
         limits = self.limits
+        measured = np.stack([states.position, states.velocity, states.current])
+        unreal = states.is_fresh & ~np.isfinite(measured).all(axis=0)
+        if unreal.any():
+            return f"position, velocity or current of {self._which(unreal)} is not a finite number"
         self._missed = np.where(states.is_fresh, 0, self._missed + 1)
         torque = np.abs(torque_of_current(states.current))
-        strained = np.where(torque > limits.torque_nm, self._strained + 1, 0)
+        strained = np.where(exceeds(torque, limits.torque_nm), self._strained + 1, 0)
         self._strained = np.where(states.is_fresh, strained, self._strained)  # a missing reply tells neither way
         if states.has_alert.any():
             return "a servo reports a hardware error"
@@ -114,10 +130,10 @@ class Guard:
                 f"a position is outside {limits.lowest_rad:.3f} to {limits.highest_rad:.3f} rad: "
                 f"{self._which(outside, states.position)} rad"
             )
-        fast = states.is_fresh & (np.abs(states.velocity) > limits.speed_rad_s)
+        fast = states.is_fresh & exceeds(np.abs(states.velocity), limits.speed_rad_s)
         if fast.any():
             return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {self._which(fast, states.velocity)} rad/s"
-        behind = states.is_fresh & (np.abs(states.position - self.goals) > limits.following_error_rad)
+        behind = states.is_fresh & exceeds(np.abs(states.position - self.goals), limits.following_error_rad)
         if behind.any():
             return (
                 f"a servo is further than {limits.following_error_rad:g} rad from its goal, blocked or overloaded: "
@@ -126,6 +142,18 @@ class Guard:
         too_long = states.is_fresh & (self._strained >= limits.patience_cycles)
         if too_long.any():
             return f"the torque exceeds {limits.torque_nm:g} N·m: {self._which(too_long, torque)} N·m"
+        return self._heat(states.temperature)
+
+    def _heat(self, temperature: Array) -> str:
+        """Why the motion must stop by the temperatures that were told, or have not been for long; "" if it need not."""
+        untold = np.isnan(temperature)
+        self._untold = np.where(untold, self._untold + 1, 0)
+        hot = ~untold & exceeds(temperature, self._hottest)
+        if hot.any():
+            return too_hot(self._which(hot, temperature), self._hottest[hot])
+        unknown = exceeds(self._untold, _LONGEST_UNTOLD)
+        if unknown.any():
+            return f"no temperature from {self._which(unknown)} in {_LONGEST_UNTOLD} cycles: elastic hardware check"
         return ""
 
     def _which(self, are: BoolArray, values: Array | None = None) -> str:
@@ -135,4 +163,18 @@ class Guard:
 
     def _outside(self, positions: Array) -> BoolArray:
         low, high = self.limits.lowest_rad - self.limits.margin_rad, self.limits.highest_rad + self.limits.margin_rad
-        return (positions < low) | (positions > high)
+        return is_outside(positions, low, high)
+
+
+def too_hot(which: str, hottest: Array) -> str:
+    """Words for servos that are too hot.
+
+    Args:
+        which: Their names with their temperatures [°C].
+        hottest: What each may have, (n,) [°C].
+    """
+    allowed = ", ".join(f"{degrees:g}" for degrees in np.atleast_1d(hottest))
+    return (
+        f"too hot: {which} °C, at most {allowed} °C are allowed (temperature_c, or the servo's own temperature_limit); "
+        "let it cool, and look for what it has to hold or what blocks it"
+    )

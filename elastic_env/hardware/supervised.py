@@ -2,7 +2,6 @@
 
 import contextlib
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from elastic_env.hardware.bus import Bus, Buses, States
-from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.channel import LONGEST_WAIT_S, Channel
+from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
 from elastic_env.hardware.port import DEFAULT_BAUDRATE
 from elastic_env.hardware.protocol import require_ids
@@ -23,7 +23,11 @@ from elastic_env.signals import Array, BoolArray
 _ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
-"""Longest silence of a supervisor beyond what was asked for [s]; then it is taken for dead, and torque switched off."""
+"""Longest silence of a supervisor beyond what was asked for [s]; then it is taken for dead, and torque switched off.
+
+In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the other wait too.
+"""
+_LEAST_ANSWER_S = 0.02
 _READ_S = 0.05
 _SLOW_S = 5.0
 _SLOW_PER_SERVO_S = 1.0
@@ -72,12 +76,13 @@ class SupervisedBus:
         own, other = Channel.pair()
         with other:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports],
-                pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
+                child_command("elastic_env.hardware.supervisor", str(other.fileno()), str(baudrate), *ports),
+                env=child_environment(), pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
             )  # fmt: skip
         self._channel = Channel(own)
         self._number = 0
         self._is_enabled = False
+        self._answer_s = _ANSWER_S
         self.is_confirmed_off = False
         self._lock = threading.Lock()
         self._keeper: threading.Thread | None = None
@@ -106,7 +111,9 @@ class SupervisedBus:
             BusGoneError: The port is gone.
         """
         self._is_enabled, self.is_confirmed_off = True, False
-        answer = self._ask("enable", self._slow_s, limits=(limits or SafetyLimits()).model_dump())
+        given = limits or SafetyLimits()
+        answer = self._ask("enable", self._slow_s, limits=given.model_dump())
+        self._answer_s = max(given.hang_s, _LEAST_ANSWER_S)
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
@@ -136,7 +143,7 @@ class SupervisedBus:
 
     def read(self) -> States:
         """States without a command."""
-        return _states(self._ask("read", _READ_S + _ANSWER_S))
+        return _states(self._ask("read", _READ_S + self._answer_s))
 
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
         """Hold goals from a thread until the next cycle, for at most a time: between moving and stepping.
@@ -163,7 +170,9 @@ class SupervisedBus:
                 self._exchanged(goals, time.monotonic() + _KEEP_ALIVE_S)
 
     def _exchanged(self, goals: Array, at: float) -> dict[str, Any]:
-        return self._ask("exchange", max(at - time.monotonic(), 0.0) + _ANSWER_S, goals=goals.tolist(), at=at)
+        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan as its second value
+        wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
+        return self._ask("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Torque off.
@@ -223,14 +232,13 @@ class SupervisedBus:
             answer = self._channel.receive()
             if answer is None:
                 raise self._without_supervisor()
-            if answer["number"] != number:
-                continue
-            if "error" in answer:
-                raise _ERRORS[answer["error"]](answer["message"])
-            if "busy" not in answer:
+            if "busy" in answer:  # torque off is sent, whoever asked for it; its confirmation may take
+                within_s = self._slow_s
+                end_s = time.monotonic() + within_s
+            elif answer["number"] == number:
+                if "error" in answer:
+                    raise _ERRORS[answer["error"]](answer["message"])
                 return answer
-            within_s = self._slow_s  # torque off is sent, its confirmation may take
-            end_s = time.monotonic() + within_s
         self._process.kill()
         raise self._without_supervisor(within_s)
 
@@ -297,5 +305,5 @@ def _models(bus: Bus, ids: Sequence[int], said: list[str]) -> dict[int, int]:
 
 
 def _states(answer: dict[str, Any]) -> States:
-    names = ("position", "velocity", "current", "is_fresh", "has_alert")
-    return States(*(np.array(answer[name]) for name in names), time_s=float(answer["time_s"]))
+    names = ("position", "velocity", "current", "is_fresh", "has_alert", "temperature")
+    return States(**{name: np.array(answer[name]) for name in names}, time_s=float(answer["time_s"]))

@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from elastic_env.hardware.bounds import exceeds
 from elastic_env.hardware.bus import Bus, Buses, States
-from elastic_env.hardware.channel import Channel
+from elastic_env.hardware.channel import LONGEST_WAIT_S, Channel
 from elastic_env.hardware.checks import check_bus
 from elastic_env.hardware.control_table import explain_errors
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.realtime import Priority, prefer_realtime, sleep_until
-from elastic_env.hardware.safety import Guard, SafetyLimits
+from elastic_env.hardware.safety import Guard, SafetyLimits, too_hot
 
-_LONGEST_WAIT_S = 0.02
 _REPLY_TIMEOUT_S = 0.003
 _WATCHDOG_COUNTS = 3  # of 20 ms
 _WATCHDOG_CLEAR = 0
@@ -114,8 +114,10 @@ class Supervisor:
         for bus, servo_id in self._bus.servos:
             _require_healthy(bus, servo_id)
             _require_rest(bus, servo_id)
+        given = SafetyLimits(**limits)
+        hottest = np.array([_require_cool(bus, servo_id, given) for bus, servo_id in self._bus.servos])
         measured = np.array([bus.position(servo_id) for bus, servo_id in self._bus.servos])
-        guard = Guard(SafetyLimits(**limits), measured, self._bus.names)
+        guard = Guard(given, measured, self._bus.names, hottest)
         self._fault = None
         try:
             self._write("bus_watchdog", _WATCHDOG_CLEAR)
@@ -143,9 +145,9 @@ class Supervisor:
         """Command, wait for a moment, read; the moment is on the monotonic clock, which both processes share."""
         guard = self._require_motion()
         now = time.monotonic()
-        if at - now > _LONGEST_WAIT_S:
-            raise FaultError(f"a cycle may wait {_LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
-        allowed, is_limited = guard.command(np.array(goals), min(now - self._commanded_s, _LONGEST_WAIT_S))
+        if exceeds(at - now, LONGEST_WAIT_S):
+            raise FaultError(f"a cycle may wait {LONGEST_WAIT_S} s, asked for {at - now:.3f} s")
+        allowed, is_limited = guard.command(np.array(goals), min(now - self._commanded_s, LONGEST_WAIT_S))
         was_holding = guard.is_holding
         self._bus.write_goals(allowed)
         self._commanded_s = now
@@ -229,17 +231,27 @@ def _require_healthy(bus: Bus, servo_id: int) -> None:
 
 def _require_rest(bus: Bus, servo_id: int) -> None:
     speed = abs(bus.velocity(servo_id))
-    if speed > _REST_RAD_S:
+    if exceeds(speed, _REST_RAD_S):
         raise FaultError(
             f"servo {servo_id} at {bus.name} moves at {speed:.2f} rad/s; torque goes on at rest, below {_REST_RAD_S:g} "
             "rad/s: wait until it hangs still, then try again"
         )
 
 
+def _require_cool(bus: Bus, servo_id: int, limits: SafetyLimits) -> float:
+    """The temperature that a servo may have by the limits and its own setting [°C]; refuse one that is hotter."""
+    hottest = min(limits.temperature_c, float(bus.read(servo_id, "temperature_limit")))
+    degrees = bus.read(servo_id, "present_temperature")
+    if exceeds(degrees, hottest):
+        raise FaultError(too_hot(f"servo {servo_id} at {bus.name}: {degrees}", np.array(hottest)))
+    return hottest
+
+
 def _plain(states: States) -> dict[str, Any]:
     return {
         "position": states.position.tolist(), "velocity": states.velocity.tolist(), "current": states.current.tolist(),
         "is_fresh": states.is_fresh.tolist(), "has_alert": states.has_alert.tolist(), "time_s": states.time_s,
+        "temperature": states.temperature.tolist(),
     }  # fmt: skip
 
 

@@ -113,6 +113,11 @@ class Emulate:
     """Share of replies that end too early."""
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
+    fault: list[str] = field(default_factory=list)
+    """What breaks after a while: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf, imu_out_of_range,
+    imu_frozen."""
+    fault_after_s: float = 20.0
+    """When that happens, after the start [s]."""
     seed: int = 0
     """Seed of noise and faults."""
 
@@ -121,8 +126,9 @@ class Emulate:
         from elastic_env.entry_points import configure_testbed
         from elastic_env.hardware.emulator.config import EmulatorConfig
         from elastic_env.hardware.emulator.faults import Faults
-        from train.hardware import emulate
+        from train.hardware import emulate, require_switches
 
+        require_switches(self.fault)
         faults = Faults(
             unheard=self.unheard, lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
             latency_s=1e-3 * self.latency_ms,
@@ -131,7 +137,7 @@ class Emulate:
             ids=tuple(self.ids), model_number=self.model_number, baudrate=self.baudrate, faults=faults, seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
         )  # fmt: skip
-        emulate(config, CONSOLE)
+        emulate(config, CONSOLE, dict.fromkeys(self.fault, True), self.fault_after_s)
 
 
 @dataclass

@@ -1,10 +1,15 @@
 """What can go wrong on a bus, by switch: for trying out what a program does about it."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from elastic_env.config import Model, quantity
+
+Angles = tuple[float, float, float]
+
+_NO_ANGLE = 8.0
 
 
 class Faults(Model):
@@ -19,12 +24,23 @@ class Faults(Model):
     latency_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of every reply: the adapter's latency timer")
     overload: bool = False
     """Whether the servos report an overload and let go."""
+    hot: bool = False
+    """Whether the servos are at 95 °C, and report no error."""
     silent: bool = False
     """Whether the servos hear but do not answer."""
     unplugged: bool = False
     """Whether the port is gone."""
     imu_silent: bool = False
     """Whether the IMU sends nothing."""
+    imu_late_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of the IMU's packets")
+    imu_nan: bool = False
+    """Whether the IMU sends nan for the roll, as valid."""
+    imu_inf: bool = False
+    """Whether it sends an infinite roll, as valid."""
+    imu_out_of_range: bool = False
+    """Whether it sends a roll that no angle has, as valid."""
+    imu_frozen: bool = False
+    """Whether its packets go on, with the angles of the last one before."""
     imu_corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of IMU packets with a flipped bit")
 
 
@@ -41,6 +57,22 @@ def damage(faults: Faults, reply: bytes, generator: np.random.Generator) -> tupl
     if chance[3] < faults.truncated:
         reply = reply[: int(generator.integers(1, len(reply)))]
     return reply, delay
+
+
+def distort(faults: Faults, angles: Angles, last: Angles) -> Angles:
+    """Roll, pitch and yaw as a faulty IMU sends them [rad].
+
+    Args:
+        faults: What is wrong with it.
+        angles: What it has measured [rad].
+        last: What it has sent last [rad].
+    """
+    if faults.imu_frozen:
+        return last
+    for is_so, roll in ((faults.imu_nan, math.nan), (faults.imu_inf, math.inf), (faults.imu_out_of_range, _NO_ANGLE)):
+        if is_so:
+            return roll, *angles[1:]
+    return angles
 
 
 def flip_bit(data: bytes, generator: np.random.Generator) -> bytes:

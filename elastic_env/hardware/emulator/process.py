@@ -22,7 +22,7 @@ import numpy as np
 from elastic_env.hardware import protocol
 from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.config import EmulatorConfig
-from elastic_env.hardware.emulator.faults import changed, damage, flip_bit
+from elastic_env.hardware.emulator.faults import Angles, changed, damage, distort, flip_bit
 from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.mip import attitude_packet
 from elastic_env.hardware.emulator.servo import EmulatedServo
@@ -35,6 +35,7 @@ _PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at 
 _SETTLE_S = 3e-4  # after a write, for the kernel to pass it on, which it does at a lower priority than ours
 _UNREAD_BYTES = 2000
 _KEPT_EVENTS = 100_000
+_WOBBLE_RAD = 1e-5
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
@@ -96,7 +97,9 @@ class Emulator:
         self.imu_terminal = Terminal.opened()
         self.faults = config.faults
         # of replies, IMU and instructions: who asks for replies gets the same faults, whatever the time
-        self._line, self._imu, self._way = (np.random.default_rng([config.seed, stream]) for stream in range(3))
+        self._line, self._imu, self._way, self._wobble = (
+            np.random.default_rng([config.seed, stream]) for stream in range(4)
+        )
         self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
         self._servos = [
             EmulatedServo(servo_id, model, partial(self._note, index), config.claimed_model_number, motor)
@@ -106,6 +109,8 @@ class Emulator:
         self._bus = EmulatedBus(self._servos)
         self._parser = protocol.Parser()
         self._replies: deque[tuple[float, bytes]] = deque()
+        self._attitudes: deque[tuple[float, bytes]] = deque()
+        self._angles: Angles = (0.0, 0.0, 0.0)
         self._next_imu_s = self._start_s = self._settled_s = time.monotonic()
 
     def step(self, wait_s: float, control: int | None = None) -> bool:
@@ -133,7 +138,9 @@ class Emulator:
         if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:  # after the answers, which are urgent
             self._joints.advance(now)
         self._send_due(time.monotonic())
-        self._send_attitude(now)
+        self._measure_attitude(now)
+        while self._attitudes and self._attitudes[0][0] <= now:
+            self.imu_terminal.write(self._attitudes.popleft()[1])
         return control in ready
 
     def set_faults(self, changes: dict[str, Any]) -> None:
@@ -141,6 +148,7 @@ class Emulator:
         self.faults = changed(self.faults, changes)
         for servo in self._servos:
             servo.overload(self.faults.overload)
+            servo.heat(self.faults.hot)
         if self.faults.unplugged and self.bus_terminal is not None:
             self.bus_terminal.close()
             self.bus_terminal = None
@@ -169,7 +177,8 @@ class Emulator:
     def _idle(self, wait_s: float) -> float:
         now = time.monotonic()
         physics_s = self._settled_s if self._settled_s > now else now + _PHYSICS_S
-        return max(min(now + wait_s, physics_s, self._next_imu_s, self._next_packet_s()) - now, 0.0)
+        attitude_s = self._attitudes[0][0] if self._attitudes else math.inf
+        return max(min(now + wait_s, physics_s, self._next_imu_s, attitude_s, self._next_packet_s()) - now, 0.0)
 
     def _next_packet_s(self) -> float:
         """When the adapter has enough replies to pass on, or has waited long enough."""
@@ -207,7 +216,7 @@ class Emulator:
             self.bus_terminal.write(due)
             self._settled_s = time.monotonic() + _SETTLE_S
 
-    def _send_attitude(self, now: float) -> None:
+    def _measure_attitude(self, now: float) -> None:
         if now < self._next_imu_s:
             return
         period = 1.0 / self.config.imu_rate_hz
@@ -216,10 +225,14 @@ class Emulator:
             return
         noise = self._imu.standard_normal(1)
         roll = attitude(self.config.testbed.scenario.imu, self._joints.q[:1], np.zeros(1), noise)
-        sent = attitude_packet(float(roll[0]), 0.0, 0.0, now - self._start_s)
+        # a real IMU should never send the same three angles twice; the roll is as good as the scenario says
+        pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
+        measured = math.remainder(float(roll[0]), 2.0 * math.pi), float(pitch), float(yaw)
+        self._angles = distort(self.faults, measured, self._angles)
+        sent = attitude_packet(*self._angles, now - self._start_s)
         if self._imu.random() < self.faults.imu_corrupted:
             sent = flip_bit(sent, self._imu)
-        self.imu_terminal.write(sent)
+        self._attitudes.append((now + self.faults.imu_late_s, sent))
 
 
 def serve(config: EmulatorConfig) -> None:

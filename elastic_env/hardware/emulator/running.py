@@ -2,12 +2,12 @@
 
 import json
 import subprocess
-import sys
 import time
 from typing import Any
 
 import numpy as np
 
+from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.errors import HardwareError
 
@@ -29,7 +29,7 @@ class RunningEmulator:
     def __init__(self, config: EmulatorConfig | None = None) -> None:
         given = (config or EmulatorConfig()).model_dump_json()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "elastic_env.hardware.emulator.process", given],
+            child_command("elastic_env.hardware.emulator.process", given), env=child_environment(),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip
         self._take_ports(self._hear())

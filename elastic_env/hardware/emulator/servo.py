@@ -11,6 +11,8 @@ from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, current_of_torqu
 OVERLOAD = 1 << 5
 """Bit of an overload in the hardware error status."""
 
+_COOL_C, _HOT_C = 35, 95
+
 _SWITCHES = ("torque_enable", "goal_position", "bus_watchdog")
 _WATCHDOG_UNIT_S = 0.02
 _WATCHDOG_FIRED = -1
@@ -81,7 +83,7 @@ class EmulatedServo:
         current_limit, allowed_a = self.model.current_limit, current_of_torque(LARGEST_TORQUE_NM)
         self._set(current_limit, min(self._get(current_limit), int(allowed_a / self.model.current_unit)))
         self._set("present_input_voltage", 240)
-        self._set("present_temperature", 35)
+        self.heat(False)
 
     @property
     def is_on(self) -> bool:
@@ -109,6 +111,10 @@ class EmulatedServo:
         self._set("present_position", round(motor.position / model.position_unit))
         self._set("present_velocity", round(motor.velocity / model.velocity_unit))
         self._set("present_current", round(current_of_torque(motor.torque) / model.current_unit))
+
+    def heat(self, is_hot: bool) -> None:
+        """Make it hot, which it shows as its temperature alone, or let it cool."""
+        self._set("present_temperature", _HOT_C if is_hot else _COOL_C)
 
     def overload(self, is_overloaded: bool) -> None:
         """Begin or end an overload: the status shows it, and the servo lets go (factory setting of shutdown)."""
