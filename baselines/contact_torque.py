@@ -61,9 +61,9 @@ class LegTorque:
 
     def _at(self, q: Array) -> LegLoads:
         """At joint angles; torque and gradient are asked for at the same ones."""
-        if self._last is None or self._last[0] is not q:
+        if self._last is None or not np.array_equal(self._last[0], q):
             posture = self._chains.posture(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
-            self._last = q, self._loads(posture)
+            self._last = q.copy(), self._loads(posture)
         return self._last[1]
 
 

@@ -75,7 +75,10 @@ def _open(build: Builder) -> Builder:
 
 def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
     if not hasattr(env.unwrapped, "truth"):
-        raise ConfigurationError("the oracle needs the truth of one environment, a mixture of scenarios has several")
+        raise ConfigurationError(
+            "the oracle reads the truth, by a method truth() of the environment, which "
+            f"{type(env.unwrapped).__name__} does not have"
+        )
     if isinstance(model, WalkerModel):
         controller = _controller(env, env.unwrapped.truth().model, options)
         return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)

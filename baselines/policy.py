@@ -91,11 +91,20 @@ class ObservationView:
         return rows
 
     def is_start(self, rows: Array) -> BoolArray:
-        """Whether an observation can be the first of an episode: by its clock, or standing with nothing commanded."""
+        """Whether an observation can be the first of an episode: by its clock, or standing with nothing commanded.
+
+        Nothing is commanded where the last command is the reference, or zero, as an environment may begin with.
+        """
         if self._clock is not None:
             return rows[:, self._clock][:, 0] < 1.5 * self._period_s
-        standing = (rows[:, self._q_dot] == 0.0).all(axis=1)
-        return standing & (rows[:, self._command] == rows[:, self._q]).all(axis=1)
+        command = rows[:, self._command]
+        nothing = (command == rows[:, self._q]).all(axis=1) | (command == 0.0).all(axis=1)
+        return (rows[:, self._q_dot] == 0.0).all(axis=1) & nothing
+
+    @property
+    def sign_of_start(self) -> str:
+        """By what `is_start` knows it, in words."""
+        return "clock.time" if self._clock is not None else "a reference at rest, and no command yet"
 
 
 def resume(
@@ -106,8 +115,9 @@ def resume(
         starts = view.is_start(rows) if episode_start is None else np.broadcast_to(episode_start, (len(rows),))
         if not np.all(starts):
             raise ElasticError(
-                "predict() was called in the middle of an episode without `state`: this policy has memory; pass the "
-                "state that the last call returned, and episode_start=True where an episode begins"
+                "predict() was called without `state` in what looks like the middle of an episode (a beginning is "
+                f"known by {view.sign_of_start}): this policy has memory; pass the state that the last call returned, "
+                "and episode_start=True where an episode begins"
             )
         return begin(), None
     memory, inner_state = state

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, field_validator
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from baselines.correction import Corrected, ResidualSettings
 from baselines.evidence import caution
@@ -167,7 +167,8 @@ def save_residual(folder: Path, description: ResidualDescription, tensors: Tenso
     """
     Network(description, tensors)
     folder.mkdir(parents=True, exist_ok=True)
-    save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, folder / WEIGHTS)
+    weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+    (folder / WEIGHTS).write_bytes(weights)  # its own file writer has an error of its own for a full disk
     (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 

@@ -5,6 +5,8 @@ commands the robot, rewards are summed, and the next observation is that of the 
 a decision takes no further part in it: its observation and reward are those up to its end.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -160,9 +162,6 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._deciding = _Deciding(env, base_policy, chosen, env.num_envs)
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
-        inner.autoreset_mode = AutoresetMode.DISABLED
-        inner.metadata = {**inner.metadata, "autoreset_mode": AutoresetMode.DISABLED}
-        self.metadata = {**inner.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = _box(self._deciding.features.width)
         self.single_action_space = gymnasium.spaces.Box(
             -1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32
@@ -173,6 +172,11 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._last: Array | None = None
         self._done = np.zeros(env.num_envs, dtype=np.bool_)
         self._decisions, self._cut_at = 0, np.zeros(env.num_envs, dtype=np.int64)
+
+    @property
+    def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """What Gymnasium's wrappers ask for."""
+        return {**self.env.metadata, "autoreset_mode": self.autoreset_mode}
 
     @property
     def settings(self) -> ResidualSettings:
@@ -239,7 +243,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         reason = np.full(n, "", dtype="<U16")
         for _ in range(self.settings.decision_period):
             command = np.where(alive[:, None], self._deciding.act(self._rows, residual), np.float32(0.0))
-            self._rows, gained, fell, finished, info = self.env.step(command)
+            with _no_restarts(self.env.unwrapped):
+                self._rows, gained, fell, finished, info = self.env.step(command)
             reward += np.where(alive, gained, 0.0)
             ended = alive & (fell | finished)
             if ended.any():
@@ -260,6 +265,16 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         if final is not None:
             features = np.where((terminated | truncated)[:, None], final, features)
         return _Outcome(features, reward, terminated, truncated, info)
+
+
+@contextmanager
+def _no_restarts(env: Any) -> Iterator[None]:
+    """Have worlds that end stay as they are for a step; whoever steps the environment itself finds it unchanged."""
+    mode, env.autoreset_mode = env.autoreset_mode, AutoresetMode.DISABLED
+    try:
+        yield
+    finally:
+        env.autoreset_mode = mode
 
 
 class _Outcome:

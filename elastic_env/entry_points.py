@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -10,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from elastic_env.elasticity import ElasticJoint
 from elastic_env.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.errors import ConfigurationError, shown, unknown_name
 from elastic_env.references import AnyReference, make_reference
 from elastic_env.rendering import TestbedPicture, WalkerPicture
 from elastic_env.robots.dynamixel import H54_200_S500_R
@@ -151,9 +152,12 @@ def make_testbed_vector(
     **arguments: Any,
 ) -> ElasticVectorEnv:
     """Vector entry point of `elastic_env/Testbed-v0`; arguments as in `configure_testbed`."""
-    _require_vector_arguments(num_envs, num_threads, render_mode)
+    _require_vector_arguments(num_envs, num_threads)
     config = _configure(configure_testbed, "elastic_env/Testbed-v0", arguments)
-    return ElasticVectorEnv(TestbedTask(config, num_envs), num_threads, autoreset_mode)
+    picture = partial(TestbedPicture, config.pendulum)
+    return ElasticVectorEnv(
+        TestbedTask(config, num_envs), num_threads, autoreset_mode, render_mode=render_mode, picture=picture
+    )
 
 
 def make_walk(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
@@ -171,18 +175,16 @@ def make_walk_vector(
     **arguments: Any,
 ) -> ElasticVectorEnv:
     """Vector entry point of `elastic_env/WalkInPlace-v0`; arguments as in `configure_walk`."""
-    _require_vector_arguments(num_envs, num_threads, render_mode)
-    config = _configure(configure_walk, "elastic_env/WalkInPlace-v0", arguments)
-    return ElasticVectorEnv(WalkTask(config, num_envs), num_threads, autoreset_mode)
+    _require_vector_arguments(num_envs, num_threads)
+    task = WalkTask(_configure(configure_walk, "elastic_env/WalkInPlace-v0", arguments), num_envs)
+    picture = partial(WalkerPicture, task)
+    return ElasticVectorEnv(task, num_threads, autoreset_mode, render_mode=render_mode, picture=picture)
 
 
-def _require_vector_arguments(num_envs: int, num_threads: int, render_mode: str | None) -> None:
-    if render_mode is not None:
-        raise ConfigurationError(f"the vector environment does not render, got render_mode {render_mode!r}; use None")
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise ConfigurationError(f"num_envs must be a whole number >= 1, got {num_envs!r}")
-    if num_threads < 0:
-        raise ConfigurationError(f"num_threads must be >= 0, 0 for all cores, got {num_threads}")
+def _require_vector_arguments(num_envs: int, num_threads: int) -> None:
+    for name, number, least, note in (("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, ", 0 for all")):
+        if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
+            raise ConfigurationError(f"{name} must be a whole number >= {least}{note}, got {shown(number)}")
 
 
 def _configure(configure: Callable[..., ConfigT], environment: str, arguments: dict[str, Any]) -> ConfigT:

@@ -1,11 +1,13 @@
 """Gymnasium faces of the worlds: one world as an `Env`, many as a `VectorEnv`."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -29,6 +31,20 @@ class _Faces:
     """What both environments show of their worlds."""
 
     _worlds: Worlds
+    _picture: Picture | None = None
+    _make_picture: Callable[[], Picture] | None = None
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made this environment, with the length of its episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and spec.max_episode_steps is None:
+            spec = dataclasses.replace(spec, max_episode_steps=self.task.num_steps)
+        self._spec = spec
 
     @property
     def assumed_model(self) -> RobotModel:
@@ -49,8 +65,26 @@ class _Faces:
         """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
         return self._worlds.task.truth()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but window and renderer, which are made again when they are needed."""
+        return {**vars(self), "_picture": None}
 
-class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
+    def _let_go(self) -> None:
+        """Close the window, free the renderer, let hardware go."""
+        self._worlds.simulation.close()
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def _draw(self) -> Picture:
+        if self._picture is None:
+            if self._make_picture is None:
+                raise ConfigurationError("this environment has no picture")
+            self._picture = self._make_picture()
+        return self._picture
+
+
+class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One world of a task.
 
     Args:
@@ -76,7 +110,6 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         self.action_space = task.action_table.space(np.float32)
         self._worlds = Worlds(task, num_threads=1, is_scalar=True, simulation=simulation)
         self._make_picture = picture
-        self._picture: Picture | None = None
         self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
         self._steps = 0
 
@@ -107,28 +140,18 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):
         """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
         return self._draw().rgb(self._worlds.signals()) if self.render_mode == "rgb_array" else None
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but window and renderer, which are made again when they are needed."""
-        return {**vars(self), "_picture": None}
-
     def close(self) -> None:
         """Close the window, free the renderer, let hardware go."""
-        self._worlds.simulation.close()
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
-
-    def _draw(self) -> Picture:
-        if self._picture is None:
-            self._picture = self._make_picture()
-        return self._picture
+        self._let_go()
 
     def _render_human(self) -> None:
         if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
             self._draw().show(self._worlds.signals())
 
 
-class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]):
+class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
+    _Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+):
     """Many worlds of a task on a thread pool.
 
     World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever the number of worlds
@@ -139,6 +162,8 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         num_threads: Threads of the physics, 0 for all cores.
         autoreset_mode: Gymnasium's `AutoresetMode` or its value.
         simulation: What moves instead of MuJoCo, such as hardware.
+        render_mode: "rgb_array" or None.
+        picture: Makes the picture of the task when it is first rendered.
     """
 
     def __init__(
@@ -147,12 +172,16 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         num_threads: int = 0,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         simulation: Simulation | None = None,
+        render_mode: str | None = None,
+        picture: Callable[[], Picture] | None = None,
     ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise unknown_name("render mode of a vector environment", render_mode, ["rgb_array"])
+        self.render_mode, self._make_picture = render_mode, picture
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
             raise unknown_name("autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode]) from None
-        self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.num_envs = task.num_worlds
         self.single_observation_space = task.observation_table.space(np.float64)
         self.single_action_space = task.action_table.space(np.float32)
@@ -161,6 +190,7 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
         self._worlds = Worlds(task, num_threads, simulation=simulation)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
+        self._is_begun = False
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -174,12 +204,15 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
             if seeds[world] is not None:
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask)
+        self._is_begun = True
         return self._worlds.task.observe(), self._worlds.signals()
 
     def step(
         self, actions: Action
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
         """One control period in every world under command offsets, (num_envs, n) [rad]."""
+        if not self._is_begun:
+            raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         restarting, given = self._done, np.asarray(actions)
         some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
         if some_restart and given.shape == self.action_space.shape:
@@ -196,9 +229,21 @@ class ElasticVectorEnv(_Faces, gymnasium.vector.VectorEnv[Observation, Action, n
                 info = _with_mask(info, done)
         return observation, result.reward, result.terminated, result.truncated, info
 
+    @property
+    def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What Gymnasium's wrappers ask for."""
+        return {**ElasticEnv.metadata, "render_modes": ["rgb_array"], "autoreset_mode": self.autoreset_mode}
+
+    def render(self) -> tuple[Observation, ...] | None:
+        """The present picture of every world, (height, width, 3) uint8, which takes some 20 ms each."""
+        if self.render_mode is None:
+            return None
+        signals = self._worlds.signals()
+        return tuple(self._draw().rgb(signals, world) for world in range(self.num_envs))
+
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
-        """Let hardware go."""
-        self._worlds.simulation.close()
+        """Free the renderer, let hardware go."""
+        self._let_go()
 
     def _begin(self, worlds: BoolArray) -> None:
         self._worlds.restart(worlds, self._generators)

@@ -41,7 +41,8 @@ class MissingExtraError(ElasticError):
 def missing_extra(package: str, extra: str, purpose: str) -> MissingExtraError:
     """The error for an optional package that is not there, with the command that installs it."""
     return MissingExtraError(
-        f"{purpose} needs the package {package}; install it with: pip install 'elastic-env[{extra}]'"
+        f"{purpose} needs the package {package}; in the checkout of elastic-env install it with: "
+        f"pip install -c constraints.txt '.[{extra}]'"
     )
 
 

@@ -85,11 +85,12 @@ class _Warnings:
         """Worlds with a bad number, from the counts of all warnings, (num_worlds, kinds)."""
         if not counts.any():
             return np.zeros(len(counts), dtype=np.bool_)
-        for kind in np.flatnonzero(counts.any(axis=0)).tolist():
+        is_bad = np.asarray(counts[:, _BAD].any(axis=1))
+        for kind in np.flatnonzero(counts[~is_bad].any(axis=0)).tolist():  # what explodes has every fault
             if kind in _OTHERS and kind not in self._said:
                 self._said.add(kind)
                 warnings.warn(f"MuJoCo goes on, less exact; the model has {_OTHERS[kind]}", stacklevel=2)
-        return np.asarray(counts[:, _BAD].any(axis=1))
+        return is_bad
 
 
 class SingleWorld:

@@ -163,7 +163,7 @@ def test_unknown_names_list_the_choices_and_suggest_the_closest() -> None:
         "unknown policy 'inptu'; choose one of: zero, input. Did you mean 'input'?"
     )
     assert str(unknown_name("policy", "xyz", ["zero", "input"])) == "unknown policy 'xyz'; choose one of: zero, input."
-    assert "pip install 'elastic-env[train]'" in str(missing_extra("torch", "train", "training"))
+    assert "pip install -c constraints.txt '.[train]'" in str(missing_extra("torch", "train", "training"))
 
 
 def test_a_yaml_file_becomes_the_model(tmp_path: Path) -> None:

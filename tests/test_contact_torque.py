@@ -442,3 +442,13 @@ def test_output_compensator_finds_the_links_of_the_compensated_robot() -> None:
     estimate = GravityCompensator(model(), "taylor").at(observation[None]).link_angle(truth.theta, np.zeros((1, 0)))
     assert np.abs(truth.theta - truth.q).max() > 0.02
     np.testing.assert_allclose(estimate, truth.q, rtol=0.0, atol=1e-3)
+
+
+def test_angles_that_change_in_place_are_new_angles() -> None:
+    """Catches a result that is kept by the identity of an array."""
+    static = make_gravity(model(), "com").at(rows(2, load_share=0.3))
+    q = np.full((2, 12), 0.1)
+    static.gravity_torque(q)
+    q += 0.2
+    fresh = make_gravity(model(), "com").at(rows(2, load_share=0.3))
+    np.testing.assert_array_equal(static.gravity_torque(q), fresh.gravity_torque(q.copy()))

@@ -1,6 +1,7 @@
 """What goes wrong with the system or with a user's policy is one sentence, and an exit code that says which."""
 
 import errno
+import io
 import os
 import resource
 import signal
@@ -8,13 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from elastic_env.errors import ConfigurationError, SystemFailedError
 from train.failures import explained
+from train.workers import WorkerKilledError, duration, plain_progress
 
 POLICIES = """
 import numpy as np
@@ -30,6 +32,14 @@ def nan(env):
     return Policy(env, lambda shape: np.full(shape, np.nan))
 def shape(env):
     return Policy(env, lambda shape: np.zeros(7))
+"""
+KILLED = """
+import multiprocessing, os, signal, time
+def killed(env):
+    if multiprocessing.parent_process() is None:
+        return Policy(env, np.zeros)
+    time.sleep(4.0)
+    os.kill(os.getpid(), signal.SIGKILL)
 """
 COMPARISON = """
 name: cells
@@ -50,10 +60,10 @@ def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[s
         (ConfigurationError("no"), "no", 2),
         (SystemFailedError("gone"), "gone", 3),
         (OSError(errno.ENOSPC, "No space left on device", "runs/x"), "runs/x: No space left on device; free some", 3),
-        (BrokenProcessPool(), "a worker process was killed", 3),
+        (WorkerKilledError([]), "a worker process was killed", 3),
         (MemoryError(), "there is not enough memory", 3),
-        (ModuleNotFoundError("", name="torch"), "needs the package torch: install the extra train", 2),
-        (ModuleNotFoundError("", name="plotly.offline"), "install the extra report", 2),
+        (ModuleNotFoundError("", name="torch"), "constraints.txt '.[train]'", 2),
+        (ModuleNotFoundError("", name="plotly.offline"), "constraints.txt '.[report]'", 2),
     ],
 )
 def test_a_failure_is_a_sentence_and_a_code(error: Exception, said: str, code: int) -> None:
@@ -91,6 +101,17 @@ def test_the_other_cells_of_a_comparison_are_kept(tmp_path: Path) -> None:
     assert "ZeroDivisionError" in run.stderr
     assert "the other 1 cells are in runs/cells/episodes.csv" in run.stdout
     assert ",input,"[1:] in (tmp_path / "runs" / "cells" / "episodes.csv").read_text()
+
+
+def test_what_had_been_played_before_a_worker_was_killed_is_kept(tmp_path: Path) -> None:
+    """Catches a comparison whose folder goes with the process that the system killed."""
+    (tmp_path / "mine.py").write_text(POLICIES + KILLED)
+    (tmp_path / "cells.yaml").write_text(COMPARISON.replace("raises", "killed"))
+    run = elastic("compare", "cells.yaml", "--jobs", "2", cwd=tmp_path)
+    assert run.returncode == 3, run.stderr
+    assert "a worker process was killed" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert "the other 1 cells are in runs/cells/episodes.csv" in run.stdout
 
 
 def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
@@ -131,3 +152,23 @@ def test_a_file_that_cannot_grow_is_one_sentence(size: int, tmp_path: Path) -> N
     assert run.returncode == 3, run.stderr
     assert "File too large" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(34.0, "30 s"), (62.0, "60 s"), (89.0, "90 s"), (91.0, "2 min"), (5399.0, "90 min"), (7300.0, "2 h")],
+)
+def test_a_time_to_go_is_said_in_words(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+
+
+@pytest.mark.parametrize(("whole_s", "first"), [(100.0, "  about 2 min to go"), (20.0, "  50 %")])
+def test_long_work_is_announced(whole_s: float, first: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a minute of silence, and words about what is over in a moment."""
+    now, out = 0.0, io.StringIO()
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    say = plain_progress(Console(file=out), least_s=10.0)
+    for percent in range(1, 101):
+        now = whole_s * percent / 100.0
+        say(percent / 100.0)
+    assert out.getvalue().splitlines()[0] == first

@@ -1,9 +1,11 @@
 """The environment on hardware, the IMU's stream and the commands, on an emulated bus."""
 
+import copy
 import csv
 import gc
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -451,3 +453,12 @@ def test_the_links_deflection_is_that_of_the_emulated_spring() -> None:
     torque = soft.true_pendulum.torque(np.array(info["link_angle"]))
     assert torque < -20.0
     assert info["deflection"] == pytest.approx(torque / 300.0, rel=0.05)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_hardware_is_not_copied(still: StillBus, copied: Any) -> None:
+    """Catches two environments at one port, or an error from the depths of a socket."""
+    env = make_still()
+    with pytest.raises(HardwareError, match="cannot be copied or pickled: there is one joint at its port"):
+        copied(env)
+    env.close()

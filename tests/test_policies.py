@@ -566,3 +566,31 @@ def test_compensated_takes_its_columns_from_the_compensator() -> None:
     policy = baselines.Compensated(inner, baselines.GravityCompensator(env.unwrapped.assumed_model))
     expected, _ = baselines.make("input", env).predict(observation)
     np.testing.assert_array_equal(policy.predict(observation)[0], expected)
+
+
+def of_ones_own(env: Any, first_command: float) -> tuple[Any, Array]:
+    """An environment that knows an assumed model and a table alone, and its first observation."""
+    inside = env.unwrapped
+    observation, _ = env.reset(seed=0)
+    observation = observation.copy()
+    observation[..., column(env, "last_command")] = first_command
+    task = SimpleNamespace(observation_table=inside.task.observation_table, name="my arm")
+    return SimpleNamespace(unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task)), observation
+
+
+@pytest.mark.parametrize("name", ["input", "dynamic"])
+def test_an_environment_of_ones_own_begins_with_no_command(name: str) -> None:
+    """Catches a first observation that is taken for the middle of an episode for want of a clock."""
+    own, observation = of_ones_own(scalar(), first_command=0.0)
+    baselines.make(name, own).predict(observation)
+    own, observation = of_ones_own(scalar(), first_command=0.3)
+    with pytest.raises(ElasticError, match=r"known by a reference at rest, and no command yet.*episode_start=True"):
+        baselines.make(name, own).predict(observation)
+    baselines.make(name, own).predict(observation, None, np.array([True]))
+
+
+def test_the_oracle_says_what_an_environment_of_ones_own_lacks() -> None:
+    """Catches an error that speaks of mixtures to somebody who has none."""
+    own, _ = of_ones_own(scalar(), first_command=0.0)
+    with pytest.raises(ConfigurationError, match=r"by a method truth\(\) of the environment, which SimpleNamespace"):
+        baselines.make("oracle", own)

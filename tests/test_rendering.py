@@ -254,9 +254,7 @@ class Walker:
 
     def caption(self, **points: tuple[float, float]) -> list[str]:
         """The words that go with the picture."""
-        signals = self.signals(**points)
-        self.picture._update(signals)
-        return self.picture._caption(signals)
+        return self.picture._update(self.signals(**points), 0)
 
     def pixel(self, point: tuple[float, float, float]) -> Array:
         """Row and column at which a point is seen."""
@@ -314,7 +312,7 @@ def test_factor_is_as_large_as_the_legs_allow(walker: Walker) -> None:
 def test_drawn_feet_are_where_the_true_ones_are(walker: Walker, deviations: dict[str, float]) -> None:
     """Catches joint angles that do not belong to the posture, by MuJoCo's own kinematics."""
     true = walker.stand(**deviations)
-    walker.picture._update(walker.signals())
+    walker.picture._update(walker.signals(), 0)
     data = walker.picture._data
     for side, ankle in zip("lr", true.ankles, strict=True):
         np.testing.assert_allclose(data.body(f"{side}_foot").xpos, ankle, atol=1e-9)
@@ -328,7 +326,7 @@ def test_drawn_feet_are_where_the_true_ones_are(walker: Walker, deviations: dict
 def test_translucent_robot_is_the_plan(walker: Walker) -> None:
     """Catches a plan of another row, and one that moves with the robot."""
     walker.stand(roll=0.05)
-    walker.picture._update(walker.signals())
+    walker.picture._update(walker.signals(), 0)
     rigid = walker.robot.rigid
     data, plan = mujoco.MjData(rigid), walker.walk.plan
     data.qpos[:3], data.qpos[3:7] = plan.pelvis[ROW], [1.0, 0.0, 0.0, 0.0]

@@ -522,3 +522,19 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
     (path / "weights.safetensors").write_bytes(b"\x80\x04pickle")
     with pytest.raises(ConfigurationError, match="cannot be read: it is missing, cut"):
         baselines.make(f"residual:{path}", env)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_the_environment_under_a_wrapper_stays_as_it_was(mode: AutoresetMode) -> None:
+    """Catches a wrapper that changes how the caller's own environment restarts."""
+    env, alone = vector("testbed", 2, mode), vector("testbed", 2, mode)
+    wrapped = ResidualVectorWrapper(env, "input")
+    wrapped.reset(seed=3)
+    wrapped.step(np.zeros(wrapped.action_space.shape))
+    assert env.unwrapped.autoreset_mode is env.metadata["autoreset_mode"] is mode
+    assert wrapped.metadata["autoreset_mode"] is mode
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    for mine in (env, alone):
+        mine.reset(seed=3)
+    for _ in range(alone.unwrapped.task.num_steps + 3):
+        np.testing.assert_array_equal(env.step(action)[0], alone.step(action)[0])

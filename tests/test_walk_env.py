@@ -205,13 +205,6 @@ def test_gymnasium_check_env(scenario: str) -> None:
     check_env(gymnasium.make(ID, **SHORT, scenario=scenario).unwrapped, skip_render_check=True)
 
 
-def test_stable_baselines3_check_env() -> None:
-    """Catches what Stable-Baselines3 cannot train on, although Gymnasium takes it."""
-    from stable_baselines3.common.env_checker import check_env as check_sb3_env
-
-    check_sb3_env(gymnasium.make(ID, **SHORT).unwrapped, skip_render_check=True)
-
-
 def test_make_and_make_vec_find_the_environments() -> None:
     """Catches a registration that points elsewhere, and arguments that do not arrive."""
     env = gymnasium.make(ID, step_period=[0.4, 0.6, 0.8], num_steps=2, scenario="ideal", render_mode=None)
@@ -1368,8 +1361,9 @@ def test_a_wrong_argument_names_itself_and_what_exists(arguments: dict[str, Any]
     [
         ({"autoreset_mode": "Next"}, r"unknown autoreset mode 'Next'; choose one of: NextStep, SameStep, Disabled"),
         ({"num_envs": 0}, r"num_envs must be a whole number >= 1, got 0"),
-        ({"num_threads": -1}, r"num_threads must be >= 0, 0 for all cores, got -1"),
-        ({"render_mode": "rgb_array"}, r"does not render, got render_mode 'rgb_array'; use None"),
+        ({"num_threads": -1}, r"num_threads must be a whole number >= 0, 0 for all, got -1"),
+        ({"num_threads": "x"}, r"num_threads must be a whole number >= 0, 0 for all, got 'x'"),
+        ({"render_mode": "human"}, r"unknown render mode of a vector environment 'human'; choose one of: rgb_array"),
     ],
 )
 def test_a_wrong_argument_of_the_vector_environment_names_itself(arguments: dict[str, Any], message: str) -> None:

@@ -22,10 +22,9 @@ from train.kinds import is_a
 from train.report import Results, require_plotly, write_report
 from train.runs import run_folder
 from train.summary import print_summary, write_episodes, write_summary
-from train.workers import CellsFailedError, run_conditions
+from train.workers import CellsFailedError, require_jobs, run_conditions
 
 _MOST_CELLS = 10_000
-_MOST_JOBS = 1024
 
 
 class Sweep(Model):
@@ -189,9 +188,7 @@ def compare(
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
         ResultsExistError: The output folder holds results.
     """
-    if not 0 <= jobs <= _MOST_JOBS:
-        bound = ">= 0" if jobs < 0 else f"<= {_MOST_JOBS}"
-        raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {shown(jobs)}")
+    require_jobs(jobs)
     plots.require_matplotlib()
     if report:
         require_plotly()

@@ -5,7 +5,6 @@ policy gains over them is what it makes of what it sees.
 """
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainC
 from train.trainer import Trainer
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
-_CHECKPOINT = "checkpoint.json"
+_TOLD = "told.json"
 _FALL_COST = 1e6
 """Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its penalties."""
 
@@ -71,9 +70,7 @@ class ConstantSearch(Trainer):
         self._told: list[list[float]] = []
         self._done = 0
         folder.mkdir(parents=True, exist_ok=True)
-        if (folder / _CHECKPOINT).exists():
-            self._resume()
-        self._scores.forget_after(self.done)
+        self._go_on()
 
     @property
     def done(self) -> int:
@@ -84,18 +81,14 @@ class ConstantSearch(Trainer):
         candidates = self._ask()
         self._tell(candidates, self._play(candidates))
 
-    def checkpoint(self) -> None:
-        """Keep what the search was told: from its seed and that, its state follows."""
+    def _write(self, checkpoint: Path) -> None:
+        """What the search was told: from its seed and that, its state follows."""
         best = float(self._scores.best) if np.isfinite(self._scores.best) else None
-        fresh = self.folder / f"{_CHECKPOINT}.new"
-        with fresh.open("w", encoding="utf-8") as file:
-            json.dump({"decisions": self.done, "best": best, "told": self._told}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(self.folder / _CHECKPOINT)
+        told = {"decisions": self.done, "best": best, "told": self._told}
+        (checkpoint / _TOLD).write_text(json.dumps(told), encoding="utf-8")
 
-    def _resume(self) -> None:
-        state = json.loads((self.folder / _CHECKPOINT).read_text(encoding="utf-8"))
+    def _read(self, checkpoint: Path) -> None:
+        state = json.loads((checkpoint / _TOLD).read_text(encoding="utf-8"))
         for costs in state["told"]:
             self._tell(self._ask(), np.array(costs))
         self._done = state["decisions"]

@@ -12,7 +12,6 @@
 
 import errno
 from collections.abc import Iterator
-from concurrent.futures.process import BrokenProcessPool
 
 WRONG_INPUT, SYSTEM_FAILED, DEFECT = 2, 3, 70
 
@@ -32,16 +31,14 @@ _CURES = {
 
 def explained(error: BaseException) -> tuple[str, int] | None:
     """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
-    from elastic_env.errors import ElasticError
+    from elastic_env.errors import ElasticError, missing_extra
 
     if is_interrupt(error):
         return "interrupted", 130
     if isinstance(error, ElasticError):
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError) and (extra := _extra_of(error)):
-        return f"this needs the package {error.name}: install the extra {extra}, such as pip install '.[{extra}]'", 2
-    if isinstance(error, BrokenProcessPool):
-        return "a worker process was killed, most often for lack of memory; take fewer --jobs", SYSTEM_FAILED
+        return str(missing_extra(str(error.name), extra, "this")), WRONG_INPUT
     if isinstance(error, MemoryError):
         return "there is not enough memory; take fewer worlds or fewer --jobs", SYSTEM_FAILED
     for cause in _causes(error):

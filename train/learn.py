@@ -5,10 +5,12 @@ A run is a folder per training seed: `checkpoint/` to go on from, `best/` and `l
 and resumed ends with the same weights, bit for bit, as one that was not.
 """
 
-import os
+import io
 import random
-import shutil
+import threading
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from baselines.residual import ResidualDescription
 from train.algorithms import algorithm_class, options_named
 from train.export import network_of
 from train.sb3_env import SB3VecEnv
-from train.state import capture, read_state, readable, restore, write_state
+from train.state import capture, read_state, restore, write_state
 from train.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
 from train.trainer import Trainer
 
@@ -69,10 +71,15 @@ class Training(Trainer):
             self._learning_rate = float(self.model.lr_schedule(1.0))
             self._shrink_last_layer()
         self.model.action_space.seed(seed)
-        self._folder_ready()
-        if (folder / "checkpoint").is_dir():
-            self._resume()
-        self._scores.forget_after(self.done)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+        self._go_on()
+
+    def run(self, progress: Callable[[int], None] | None = None) -> None:
+        """See `Trainer`; what TensorBoard's thread could not write, such as to a full disk, is raised here."""
+        with _thread_raises_here():
+            super().run(progress)
+            self.model.logger.close()
 
     @property
     def done(self) -> int:
@@ -86,35 +93,21 @@ class Training(Trainer):
             self.model.lr_schedule = lambda _: rate
         self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=1)
 
-    def checkpoint(self) -> None:
-        """Keep everything that the rest of the training depends on; a kill between its steps loses nothing."""
-        fresh, old = self.folder / "checkpoint.new", self.folder / "checkpoint.old"
-        shutil.rmtree(fresh, ignore_errors=True)
-        fresh.mkdir()
-        torch.save(self._parameters(), fresh / "model.pt")
-        write_state(fresh, "state", self._state())
-        for file in fresh.iterdir():
-            _flush(file)
-        _flush(fresh)
-        shutil.rmtree(old, ignore_errors=True)
-        current = self.folder / "checkpoint"
-        if current.exists():
-            current.rename(old)
-        fresh.rename(current)
-        _flush(self.folder)
-        shutil.rmtree(old, ignore_errors=True)
+    def _write(self, checkpoint: Path) -> None:
+        parameters = io.BytesIO()  # torch itself calls a full disk an internal error
+        torch.save(self._parameters(), parameters)
+        (checkpoint / "model.pt").write_bytes(parameters.getbuffer())
+        write_state(checkpoint, "state", self._state())
 
-    def _resume(self) -> None:
-        path = self.folder / "checkpoint"
-        with readable(path):
-            parameters = torch.load(path / "model.pt", weights_only=True)
+    def _read(self, checkpoint: Path) -> None:
+        parameters = torch.load(checkpoint / "model.pt", weights_only=True)
         self.model.policy.load_state_dict(parameters["policy"])
         for name, optimiser in self._optimisers().items():
             optimiser.load_state_dict(parameters["optimisers"][name])
         if "log_ent_coef" in parameters:
             self.model.log_ent_coef.data.copy_(parameters["log_ent_coef"])
         torch.set_rng_state(parameters["rng"])
-        self._load(read_state(path, "state"))
+        self._load(read_state(checkpoint, "state"))
 
     def _parameters(self) -> dict[str, Any]:
         parameters = {
@@ -203,13 +196,6 @@ class Training(Trainer):
             layer.weight.mul_(0.01)
             layer.bias.zero_()
 
-    def _folder_ready(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        kept, moved = self.folder / "checkpoint", self.folder / "checkpoint.old"
-        if not kept.exists() and moved.exists():  # killed between the two moves
-            moved.rename(kept)
-        self.model.set_logger(configure(str(self.folder / "tensorboard"), ["tensorboard"]))
-
     def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
         """The present policy, as it is exported."""
         tensors, activation, output = network_of(self.model, self._normaliser)
@@ -224,6 +210,22 @@ class Training(Trainer):
         random.setstate(states[2])
 
 
+@contextmanager
+def _thread_raises_here() -> Iterator[None]:
+    """Keep TensorBoard's thread from printing the error that its next call raises in this one."""
+    before = threading.excepthook
+
+    def print_others(error: threading.ExceptHookArgs) -> None:
+        if getattr(error.thread, "exception", None) is not error.exc_value:
+            before(error)
+
+    threading.excepthook = print_others
+    try:
+        yield
+    finally:
+        threading.excepthook = before
+
+
 def _merged(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     policy = {**defaults.get("policy_kwargs", {}), **(given.get("policy_kwargs") or {})}
     return {**defaults, **given, **({"policy_kwargs": policy} if policy else {})}
@@ -235,15 +237,6 @@ def _resolved(options: dict[str, Any]) -> dict[str, Any]:
     if isinstance(policy.get("activation_fn"), str):
         policy["activation_fn"] = getattr(torch.nn, policy["activation_fn"])
     return {**options, "policy_kwargs": policy}
-
-
-def _flush(path: Path) -> None:
-    """Have a file or folder on the disk before anything that comes later."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _listed(value: Any) -> Any:

@@ -8,16 +8,13 @@ be missed when a training goes on. Nothing is pickled: a state is arrays and JSO
 
 import json
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from pickle import UnpicklingError
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from gymnasium import Space
@@ -179,12 +176,8 @@ def write_state(folder: Path, name: str, state: Any) -> None:
 
 
 def read_state(folder: Path, name: str) -> Any:
-    """A state that `write_state` wrote; runs no code from the files.
-
-    Raises:
-        ElasticError: The files are missing or damaged.
-    """
-    with readable(folder), np.load(folder / f"{name}.npz", allow_pickle=False) as arrays:
+    """A state that `write_state` wrote; runs no code from the files."""
+    with np.load(folder / f"{name}.npz", allow_pickle=False) as arrays:
 
         def whole(value: Any) -> Any:
             if isinstance(value, dict):
@@ -194,18 +187,3 @@ def read_state(folder: Path, name: str) -> Any:
             return [whole(part) for part in value] if isinstance(value, list) else value
 
         return whole(json.loads((folder / f"{name}.json").read_text()))
-
-
-@contextmanager
-def readable(checkpoint: Path) -> Iterator[None]:
-    """Say of a checkpoint that cannot be read within that it is missing a file or damaged.
-
-    Raises:
-        ElasticError: It is.
-    """
-    try:
-        yield
-    except (OSError, EOFError, ValueError, KeyError, RuntimeError, BadZipFile, UnpicklingError) as error:
-        raise ElasticError(
-            f"the checkpoint {checkpoint} is damaged or not whole ({error}); remove it to begin this seed anew"
-        ) from None

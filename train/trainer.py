@@ -6,8 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from baselines.residual import ResidualDescription
+from train.checkpoint import recovered, require_whole, written
 from train.scores import Scores
 from train.train_config import TrainConfig
+
+CHECKPOINT = "checkpoint"
+"""Folder, within that of a training seed, to go on from."""
 
 
 class Trainer(ABC):
@@ -45,9 +49,30 @@ class Trainer(ABC):
     def done(self) -> int:
         """Decisions so far."""
 
-    @abstractmethod
     def checkpoint(self) -> None:
-        """Keep everything that the rest depends on; a kill between its steps loses nothing."""
+        """Keep everything that the rest depends on."""
+        with written(self.folder / CHECKPOINT) as fresh:
+            self._write(fresh)
+
+    def _go_on(self) -> None:
+        """Go on from the checkpoint, if there is one; the last step of making a trainer.
+
+        Raises:
+            ElasticError: The checkpoint is not what was written.
+        """
+        path = self.folder / CHECKPOINT
+        if recovered(path):
+            require_whole(path)
+            self._read(path)
+        self._scores.forget_after(self.done)
+
+    @abstractmethod
+    def _write(self, checkpoint: Path) -> None:
+        """Write everything that the rest depends on as files of a folder."""
+
+    @abstractmethod
+    def _read(self, checkpoint: Path) -> None:
+        """Take up what `_write` has written."""
 
     @abstractmethod
     def _advance(self) -> None:

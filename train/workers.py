@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.managers import SyncManager
@@ -16,34 +17,61 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from elastic_env.errors import ElasticError
+from elastic_env.errors import ConfigurationError, ElasticError, SystemFailedError, shown
 from train.conditions import Condition
 from train.evaluate import Evaluation, PolicyFailedError, evaluate, num_steps
 
+_MOST_JOBS = 1024
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
+_ANNOUNCED_S, _LONG_S = 3.0, 30.0
+"""When the time to go is said, and from how much on [s]."""
 
 
 class CellsFailedError(ElasticError):
-    """Policies failed in some conditions.
+    """Some conditions have no result, for a policy that fails or a process that was killed.
 
     Attributes:
         finished: Evaluations of the others.
     """
 
-    def __init__(self, failed: Sequence[PolicyFailedError], finished: list[Evaluation]) -> None:
-        super().__init__("\n".join(dict.fromkeys(map(str, failed))))
+    def __init__(self, why: Sequence[ElasticError], finished: list[Evaluation]) -> None:
+        super().__init__("\n".join(dict.fromkeys(map(str, why))))
         self.finished = finished
+        self.exit_code = max(error.exit_code for error in why)  # type: ignore[misc]
+
+
+class WorkerKilledError(SystemFailedError):
+    """A process that worked beside this one was killed.
+
+    Attributes:
+        results: Of the calls, in their order; None where there is none.
+    """
+
+    def __init__(self, results: list[Any]) -> None:
+        super().__init__("a worker process was killed, most often for lack of memory; take fewer --jobs")
+        self.results = results
+
+
+def require_jobs(jobs: int) -> None:
+    """Check a number of processes.
+
+    Raises:
+        ConfigurationError: It is none.
+    """
+    if not 0 <= jobs <= _MOST_JOBS:
+        bound = ">= 0" if jobs < 0 else f"<= {_MOST_JOBS}"
+        raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {shown(jobs)}")
 
 
 def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    Raises:
-        CellsFailedError: Policies failed in some of them; it has the results of the others.
-
     The results do not depend on the number of processes. On hardware the conditions come one after the other, in this
     process, at whose terminal somebody can agree to them.
+
+    Raises:
+        CellsFailedError: Some of them have no result; it has those of the others.
     """
     if any(condition.environment.is_real for condition in conditions):
         return [
@@ -59,12 +87,17 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
             done += played
             show(0, done)
 
-        results = side_by_side(_evaluate, [(conditions[number],) for number in longest_first], jobs, advance)
+        why: list[ElasticError] = []
+        try:
+            results = side_by_side(_evaluate, [(conditions[number],) for number in longest_first], jobs, advance)
+        except WorkerKilledError as error:
+            results = error.results
+            why.append(error)
         show(0, sum(steps))
     played = [results[longest_first.index(number)] for number in range(len(conditions))]
-    failed = [result for result in played if isinstance(result, PolicyFailedError)]
-    if failed:
-        raise CellsFailedError(failed, [result for result in played if isinstance(result, Evaluation)])
+    why += [result for result in played if isinstance(result, PolicyFailedError)]
+    if why:
+        raise CellsFailedError(why, [result for result in played if isinstance(result, Evaluation)])
     return played
 
 
@@ -95,6 +128,7 @@ def side_by_side(
         report: Called with the number of the call and what it reported.
 
     Raises:
+        WorkerKilledError: A process was killed; it has the results of the calls that had ended.
         Exception: The first that a call raised, when all others have been ended.
     """
     jobs = min(jobs or os.cpu_count() or 1, len(arguments))
@@ -105,14 +139,18 @@ def side_by_side(
     with manager:
         reports = manager.Queue()
         pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_follow_parent)
+        futures: list[Future[Any]] = []
         try:
             with _ctrl_c_held():
-                futures = [pool.submit(_call, function, given, n, reports) for n, given in enumerate(arguments)]
+                futures += [pool.submit(_call, function, given, n, reports) for n, given in enumerate(arguments)]
             while not all(future.done() for future in futures):
                 for number, value in _drain(reports):
                     report(number, value)
                 _raise_first(futures)
             results = [future.result() for future in futures]
+        except BrokenProcessPool:
+            _end(pool)
+            raise WorkerKilledError([_result_of(future) for future in futures]) from None
         except BaseException:
             _end(pool)
             raise
@@ -123,6 +161,8 @@ def side_by_side(
 def plain_progress(console: Console, least_s: float = 0.0) -> Callable[[float], None]:
     """A function that takes the share of the work that is done, and says each tenth of it in a line.
 
+    Long work is announced early, with the time that it will take.
+
     For work beside a control loop and work that is timed, from which the thread of a bar would take time, and for logs.
 
     Args:
@@ -130,14 +170,28 @@ def plain_progress(console: Console, least_s: float = 0.0) -> Callable[[float], 
         least_s: Shortest time between two lines, and before the first one [s].
     """
     said, when = 0, time.monotonic()
+    begun, is_announced = when, False
 
     def say(share: float) -> None:
-        nonlocal said, when
+        nonlocal said, when, is_announced
+        elapsed = time.monotonic() - begun
+        if not is_announced and share > 0.0 and elapsed > _ANNOUNCED_S:
+            is_announced = True
+            if (to_go := elapsed * (1.0 - share) / share) > _LONG_S:
+                console.print(f"  about {duration(to_go)} to go")
         if int(10 * share) > said and time.monotonic() - when >= least_s:
             said, when = int(10 * share), time.monotonic()
             console.print(f"  {10 * said} %")
 
     return say
+
+
+def duration(seconds: float) -> str:
+    """A time in words, rounded to what matters: 40 s, 3 min, 2 h."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{10.0 * round(seconds / 10.0):.0f} s"
 
 
 @contextmanager
@@ -210,6 +264,11 @@ def _raise_first(futures: Sequence[Future[Any]]) -> None:
     for future in futures:
         if future.done():
             future.result()
+
+
+def _result_of(future: Future[Any]) -> Any:
+    """What a call returned; None where it did not end, or not well."""
+    return future.result() if future.done() and not future.cancelled() and future.exception() is None else None
 
 
 def _end(pool: ProcessPoolExecutor) -> None:

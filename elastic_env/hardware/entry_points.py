@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 from elastic_env.entry_points import configure_testbed
 from elastic_env.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.errors import ConfigurationError, unknown_name
+from elastic_env.errors import ConfigurationError, shown, unknown_name
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.hardware.testbed import HardwareTestbedTask
@@ -62,12 +62,10 @@ def make_hardware_testbed_vector(
     """Vector entry point, for the same programs to run on hardware: of one world.
 
     Raises:
-        ConfigurationError: More than one world, or a render mode.
+        ConfigurationError: More than one world.
     """
-    if num_envs != 1 or render_mode is not None:
-        raise ConfigurationError(
-            f"there is one testbed at a port, and as a vector it does not render; got num_envs {num_envs} and "
-            f"render_mode {render_mode!r}"
-        )
+    if num_envs != 1:
+        raise ConfigurationError(f"there is one testbed at a port: num_envs must be 1, got {shown(num_envs)}")
     task = configure_hardware(**arguments)
-    return ElasticVectorEnv(task, 1, autoreset_mode, task.plant)
+    picture = partial(TestbedPicture, task.config.pendulum)
+    return ElasticVectorEnv(task, 1, autoreset_mode, task.plant, render_mode, picture)

@@ -57,6 +57,14 @@ class ServoPlant:
 
     num_worlds = 1
 
+    def __getstate__(self) -> dict[str, object]:
+        """There is one joint at a port, and no copy of it.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError("an environment on hardware cannot be copied or pickled: there is one joint at its port")
+
     def __init__(
         self,
         model: mujoco.MjModel,

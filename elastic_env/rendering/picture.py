@@ -30,12 +30,12 @@ _CHARACTERS_PER_ROW = 37
 class Picture(Protocol):
     """Draws the present state of a task from its signals."""
 
-    def rgb(self, signals: Signals) -> Image:
-        """An image, (height, width, 3)."""
+    def rgb(self, signals: Signals, world: int = 0) -> Image:
+        """An image of a world, (height, width, 3)."""
         ...
 
     def show(self, signals: Signals) -> None:
-        """Update the window."""
+        """Update the window, which shows the first world."""
         ...
 
     def close(self) -> None:
@@ -59,28 +59,28 @@ class ModelPicture(ABC):
         self._viewer: Any = None
 
     @abstractmethod
-    def _pose(self, signals: Signals) -> None:
-        """Move the display model to the present state."""
+    def _pose(self, now: dict[str, float], world: int) -> None:
+        """Move the display model to the present state of a world, whose signals are given."""
 
     @abstractmethod
-    def _caption(self, signals: Signals) -> list[str]:
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:
         """Lines of text for the state that was posed last."""
 
-    def rgb(self, signals: Signals) -> Image:
+    def rgb(self, signals: Signals, world: int = 0) -> Image:
         """See `Picture`."""
-        self._update(signals)
+        caption = self._update(signals, world)
         if self._renderer is None:
             self._renderer = _renderer(self._model)
         self._renderer.update_scene(self._data, camera=CAMERA)
-        return _with_text(self._renderer.render(), self._caption(signals), self._legend)
+        return _with_text(self._renderer.render(), caption, self._legend)
 
     def show(self, signals: Signals) -> None:
         """See `Picture`."""
-        self._update(signals)
+        caption = self._update(signals, 0)
         if self._viewer is None:
             self._viewer = _window(self._model, self._data)
         corner, large = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtFontScale.mjFONTSCALE_150
-        self._viewer.set_texts([(large, corner, "\n".join(self._caption(signals)), "")])
+        self._viewer.set_texts([(large, corner, "\n".join(caption), "")])
         self._viewer.sync()
 
     def close(self) -> None:
@@ -91,9 +91,12 @@ class ModelPicture(ABC):
             self._viewer.close()
         self._renderer = self._viewer = None
 
-    def _update(self, signals: Signals) -> None:
-        self._pose(signals)
+    def _update(self, signals: Signals, world: int) -> list[str]:
+        """Pose the display model; the caption that goes with it."""
+        now = {name: float(values[world]) for name, values in signals.items()}
+        self._pose(now, world)
         mujoco.mj_forward(self._model, self._data)
+        return self._caption(now, world)
 
 
 def set_stage(spec: mujoco.MjSpec, width: int, height: int) -> None:

@@ -7,7 +7,6 @@ import mujoco
 
 from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.robots.testbed import Pendulum
-from elastic_env.signals import Signals
 
 EXAGGERATION = 8.0
 """Factor by which deviations from the reference are enlarged."""
@@ -34,18 +33,17 @@ class TestbedPicture(ModelPicture):
     def __init__(self, pendulum: Pendulum) -> None:
         super().__init__(_display_spec(pendulum), _LEGEND)
 
-    def _pose(self, signals: Signals) -> None:
-        reference, link = float(signals["reference_angle"][0]), float(signals["link_angle"][0])
-        rotor = link + float(signals["deflection"][0])
+    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the signals say it all
+        reference, link = now["reference_angle"], now["link_angle"]
+        rotor = link + now["deflection"]
         self._data.joint("reference").qpos = reference
         self._data.joint("link").qpos = exaggerated(link, reference)
         self._data.joint("rotor").qpos = exaggerated(rotor, reference)
 
-    def _caption(self, signals: Signals) -> list[str]:
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
         return [
-            f"t = {float(signals['time_s'][0]):6.2f} s     deviations from the reference drawn x {EXAGGERATION:g}",
-            f"deflection {1e3 * float(signals['deflection'][0]):+7.2f} mrad     "
-            f"link error {1e3 * float(signals['link_error'][0]):+7.2f} mrad",
+            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {EXAGGERATION:g}",
+            f"deflection {1e3 * now['deflection']:+7.2f} mrad     link error {1e3 * now['link_error']:+7.2f} mrad",
         ]
 
 

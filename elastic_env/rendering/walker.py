@@ -26,7 +26,7 @@ from elastic_env.rendering.humanoid import (
 )
 from elastic_env.rendering.picture import ModelPicture
 from elastic_env.robots.thormang import LEG_JOINTS
-from elastic_env.signals import Array, Signals
+from elastic_env.signals import Array
 from elastic_env.tasks.walk_in_place import WalkTask
 from elastic_env.tasks.walk_rows import WalkTruth
 from elastic_env.tasks.walk_tables import FELL
@@ -67,11 +67,11 @@ class Posture:
     feet_R: Array
 
     @classmethod
-    def true(cls, truth: WalkTruth) -> "Posture":
-        """That of the first world."""
-        R = truth.pelvis_R[0]
-        feet_R = R @ foot_pose(truth.model.biped.leg, truth.q[0].reshape(2, -1))[1]
-        return cls(truth.pelvis[0], R, truth.ankles[0], feet_R)
+    def true(cls, truth: WalkTruth, world: int = 0) -> "Posture":
+        """That of a world."""
+        R = truth.pelvis_R[world]
+        feet_R = R @ foot_pose(truth.model.biped.leg, truth.q[world].reshape(2, -1))[1]
+        return cls(truth.pelvis[world], R, truth.ankles[world], feet_R)
 
     @classmethod
     def planned(cls, plan: WalkPlan, row: int) -> "Posture":
@@ -117,7 +117,7 @@ class WalkerPicture(ModelPicture):
     """The walker with its plan, the ZMP and its reference.
 
     Args:
-        task: Rules of one world, whose true state is drawn.
+        task: Rules of the worlds whose true state is drawn.
     """
 
     def __init__(self, task: WalkTask) -> None:
@@ -125,20 +125,19 @@ class WalkerPicture(ModelPicture):
         self._task = task
         self._factor = LARGEST_FACTOR
 
-    def _pose(self, signals: Signals) -> None:
+    def _pose(self, now: dict[str, float], world: int) -> None:
         plan = self._task.plan
-        row = min(round(float(signals["time_s"][0]) / self._task.config.control_period_s), plan.num_steps)
+        row = min(round(now["time_s"] / self._task.config.control_period_s), plan.num_steps)
         truth = self._task.truth()
-        true, planned, robot = Posture.true(truth), Posture.planned(plan, row), truth.model.biped
+        true, planned, robot = Posture.true(truth, world), Posture.planned(plan, row), truth.model.biped
         drawn, self._factor = enlarged(true, planned, plan.share[row], robot)
         self._place("", drawn, robot)
         self._place(PLAN, planned, robot)
         for marker in (ZMP, ZMP_REFERENCE):
-            self._mark(marker, float(signals[f"{marker}_x"][0]), float(signals[f"{marker}_y"][0]))
+            self._mark(marker, now[f"{marker}_x"], now[f"{marker}_y"])
 
-    def _caption(self, signals: Signals) -> list[str]:
-        now = {name: float(values[0]) for name, values in signals.items()}
-        failures = [FELL] if self._task.has_fallen()[0] else []
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:
+        failures = [FELL] if self._task.has_fallen()[world] else []
         deviation = now["zmp_deviation"]
         zmp = "no ground contact" if np.isnan(deviation) else f"ZMP deviation {1e3 * deviation:5.1f} mm"
         return [

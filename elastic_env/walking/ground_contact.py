@@ -67,4 +67,5 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
 
 def _rows(values: Array, axes: int) -> Array:
     """One row per robot: all but the last axes in one."""
-    return np.ascontiguousarray(values).reshape(-1, *values.shape[-axes:])
+    # a broadcast view of one row counts as contiguous, but may not be written to, and Numba marks that
+    return np.require(values, requirements=["C", "W"]).reshape(-1, *values.shape[-axes:])

@@ -37,8 +37,6 @@ class Train:
 
     def run(self) -> None:
         """Train, or go on with it."""
-        if self.jobs < 0:
-            raise ConfigurationError(f"jobs must be >= 0, 0 for one per core, got {self.jobs}")
         if (self.config is None) == (self.resume is None):
             raise ConfigurationError("name either a configuration or, with --resume, the run to go on with")
         given = {"seeds": self.seeds, "decisions": self.decisions}
@@ -47,13 +45,11 @@ class Train:
             raise ConfigurationError(
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
-        try:
-            from train.run_training import resume, start
-            from train.train_config import TrainConfig
-        except ModuleNotFoundError as error:
-            raise ConfigurationError(
-                f"training needs {error.name}; install the extra: pip install 'elastic-env[train]'"
-            ) from None
+        from train.run_training import resume, start
+        from train.train_config import TrainConfig
+        from train.workers import require_jobs
+
+        require_jobs(self.jobs)
         if self.resume is not None:
             folder = resume(self.resume, CONSOLE, self.jobs, self.trust_code)
         else:

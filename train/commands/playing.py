@@ -76,7 +76,7 @@ class Evaluate:
     """Scenario, such as nominal (default), ideal, soft, stiff, payload, backlash,
     sensor, ideal+soft; on the walker also spread, push, slope."""
     reference: str | None = None
-    """Motion. Testbed: hold (default), sine, multisine, steps,
+    """Motion. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some seconds),
     or a mapping such as '{kind: sine, amplitude: 0.3}'.
     Walker: step period 24, 3 (default), 1.6 or 1.1 [s],
     or its durations of double, single, double support '[0.8, 0.6, 0.8]',

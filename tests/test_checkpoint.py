@@ -1,0 +1,140 @@
+"""Checkpoints: whole or not at all, checked before they are read, and gone on with after a full disk."""
+
+import random
+import resource
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from elastic_env.errors import ElasticError
+from tests.test_training import PPO, SMALL, interrupted_after
+from train.checkpoint import recovered, require_whole, written
+from train.failures import SYSTEM_FAILED, explained
+from train.learn import Training
+from train.train_config import TrainConfig
+
+MUTATIONS, FULL_DISKS = 300, 4
+
+
+def write(checkpoint: Path, text: str) -> None:
+    with written(checkpoint) as fresh:
+        (fresh / "one").write_text(text)
+        (fresh / "two.json").write_text('{"count": 1}')
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training seed that was interrupted behind a checkpoint."""
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.raises(KeyboardInterrupt):
+        Training(TrainConfig(**{**SMALL, **PPO}), 1, folder).run(interrupted_after(96))
+    return folder
+
+
+def flip(file: Path, chance: random.Random) -> None:
+    content = bytearray(file.read_bytes())
+    content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
+    file.write_bytes(content)
+
+
+def cut(file: Path, chance: random.Random) -> None:
+    file.write_bytes(file.read_bytes()[: chance.randrange(file.stat().st_size)])
+
+
+def repeat(file: Path, chance: random.Random) -> None:
+    content = file.read_bytes()
+    file.write_bytes(content + content[: chance.randrange(1, len(content))])
+
+
+def renumber(file: Path, chance: random.Random) -> None:
+    """Another digit somewhere: JSON remains JSON."""
+    content = bytearray(file.read_bytes())
+    digits = [at for at, byte in enumerate(content) if chr(byte).isdigit()]
+    at = chance.choice(digits)
+    content[at] = ord("0") + (content[at] - ord("0") + chance.randrange(1, 10)) % 10
+    file.write_bytes(content)
+
+
+def remove(file: Path, chance: random.Random) -> None:
+    file.unlink()
+
+
+def rename(file: Path, chance: random.Random) -> None:
+    file.rename(file.with_name(f"{file.name}{chance.randrange(10)}"))
+
+
+def replace(file: Path, chance: random.Random) -> None:
+    """One file of the checkpoint in the place of another."""
+    others = [other for other in sorted(file.parent.iterdir()) if other != file]
+    shutil.copy(chance.choice(others), file)
+
+
+def test_a_mutated_checkpoint_is_refused_before_it_is_read(trained: Path, tmp_path: Path) -> None:
+    """Catches a file that is read without its digest, and a digest that misses some change."""
+    chance, path = random.Random(26), tmp_path / "checkpoint"
+    require_whole(trained / "checkpoint")
+    for _ in range(MUTATIONS):
+        shutil.copytree(trained / "checkpoint", path, dirs_exist_ok=True)
+        file = chance.choice(sorted(path.iterdir()))
+        mutate = chance.choice([flip, cut, repeat, renumber, remove, rename, replace])
+        mutate(file, chance)
+        with pytest.raises(ElasticError, match=r"damaged or not whole .*; remove it"):
+            require_whole(path)
+        shutil.rmtree(path)
+
+
+def test_a_failure_on_the_way_leaves_the_checkpoint_before_it(tmp_path: Path) -> None:
+    """Catches a checkpoint that is removed before the new one is whole."""
+    checkpoint = tmp_path / "checkpoint"
+    write(checkpoint, "first")
+    with pytest.raises(TypeError):
+        write(checkpoint, None)  # type: ignore[arg-type]
+    assert recovered(checkpoint)
+    require_whole(checkpoint)
+    assert (checkpoint / "one").read_text() == "first"
+    write(checkpoint, "third")
+    assert (checkpoint / "one").read_text() == "third"
+
+
+def test_a_kill_between_the_moves_loses_nothing(tmp_path: Path) -> None:
+    """Catches a checkpoint that is only found under its own name."""
+    checkpoint = tmp_path / "checkpoint"
+    assert not recovered(checkpoint)
+    write(checkpoint, "first")
+    checkpoint.rename(tmp_path / "checkpoint.old")
+    assert recovered(checkpoint)
+    require_whole(checkpoint)
+
+
+@contextmanager
+def full_beyond(size: int) -> Iterator[None]:
+    """No file may become larger [bytes], as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_is_one_sentence_and_the_training_goes_on(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a library that hides a full disk, a thread that prints it, and a file that is half written and used."""
+    config, chance = TrainConfig(**{**SMALL, **PPO}), random.Random(14)
+    Training(config, 1, tmp_path / "whole").run()
+    for number in range(FULL_DISKS):
+        folder, size = tmp_path / str(number), chance.choice([0, 300, 3_000, 30_000, chance.randrange(60_000)])
+        with full_beyond(size), pytest.raises(Exception) as caught:  # noqa: PT011  `explained` judges it
+            Training(config, 1, folder).run()
+        found = explained(caught.value)
+        assert found is not None, caught.value
+        assert found[0].count("\n") == 0
+        assert found[1] == SYSTEM_FAILED
+        Training(config, 1, folder).run()
+        for file in ("last/weights.safetensors", "best/weights.safetensors", "progress.csv"):
+            assert (folder / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), (size, file)
+    assert "Traceback" not in capfd.readouterr().err

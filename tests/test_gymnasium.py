@@ -1,0 +1,125 @@
+"""Contracts of Gymnasium and Stable-Baselines3, on every registered simulation; hardware has its own test."""
+
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from elastic_env.envs import ElasticEnv, ElasticVectorEnv
+
+SIMULATIONS = {
+    "elastic_env/Testbed-v0": {"reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}},
+    "elastic_env/WalkInPlace-v0": {"step_period": [0.3, 0.4, 0.3], "num_steps": 1},
+}
+IDS = sorted(SIMULATIONS)
+
+
+def make(name: str, **arguments: Any) -> Any:
+    return gymnasium.make(name, **{**SIMULATIONS[name], **arguments})
+
+
+def make_vec(name: str, num_envs: int, **arguments: Any) -> Any:
+    return gymnasium.make_vec(
+        name, num_envs=num_envs, vectorization_mode="vector_entry_point", **{**SIMULATIONS[name], **arguments}
+    )
+
+
+def test_every_id_is_here_or_is_hardware() -> None:
+    """Catches an environment that is registered and not checked."""
+    ours = [name for name in gymnasium.registry if name.startswith("elastic_env/")]
+    assert sorted([*SIMULATIONS, "elastic_env/HardwareTestbed-v0"]) == sorted(ours)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_gymnasiums_checker_finds_nothing(name: str) -> None:
+    """Catches spaces, dtypes, seeding, rendering and return types that are not Gymnasium's."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*recommended way of making.*|.*A Box observation space.*")
+        warnings.filterwarnings("ignore", message=".*observation space (min|max)imum value is -?infinity.*")
+        warnings.filterwarnings("ignore", message=".*recommended to use a symmetric and normalized.*")
+        check_env(make(name).unwrapped, skip_render_check=True)  # which opens windows
+        drawn = make(name, render_mode="rgb_array")
+        drawn.reset(seed=0)
+        drawn.render()
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_stable_baselines3s_checker_finds_nothing(name: str) -> None:
+    """Catches what Stable-Baselines3 cannot train on, although Gymnasium takes it."""
+    check_sb3_env(make(name).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_rollouts_of_one_seed_are_equal(name: str) -> None:
+    """Catches an environment that remembers the one before, in values and in types; as Gymnasium tests its own."""
+    one, other = make(name), make(name)
+    for _ in range(2):
+        assert data_equivalence(one.reset(seed=4), other.reset(seed=4), exact=True)
+        one.action_space.seed(4)
+        for _ in range(60):
+            action = one.action_space.sample()
+            assert data_equivalence(one.step(action), other.step(action), exact=True)
+
+
+@pytest.mark.parametrize(("name", "start_method"), [(IDS[0], "fork"), (IDS[1], "fork"), (IDS[1], "spawn")])
+def test_processes_of_stable_baselines3_play_as_this_one(name: str, start_method: str) -> None:
+    """Catches an environment that does not survive the way into a process, with threads that a fork leaves behind."""
+    env, made = make(name), make(name)  # one is made before the fork
+    worlds = SubprocVecEnv([lambda: made if start_method == "fork" else make(name)] * 2, start_method=start_method)
+    try:
+        worlds.seed(5)
+        first = worlds.reset()
+        for world in range(2):
+            np.testing.assert_array_equal(first[world], env.reset(seed=5 + world)[0].astype(first.dtype))
+        action = np.full(env.action_space.shape, 0.01, dtype=np.float32)
+        for _ in range(20):
+            observation, mine = worlds.step(np.stack([action, action]))[0], env.step(action)[0]
+            np.testing.assert_array_equal(observation[1], mine.astype(observation.dtype))
+    finally:
+        worlds.close()
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_the_specification_tells_the_length_of_an_episode(name: str) -> None:
+    """Catches wrappers and libraries that ask for it and find None; a shorter one that is asked for stays."""
+    env = make(name)
+    assert isinstance(env.unwrapped, ElasticEnv)
+    assert env.spec.max_episode_steps == env.unwrapped.task.num_steps
+    many = make_vec(name, 2)
+    assert isinstance(many.unwrapped, ElasticVectorEnv)
+    assert many.spec.max_episode_steps == env.unwrapped.task.num_steps
+    assert make(name, max_episode_steps=7).spec.max_episode_steps == 7
+    again = gymnasium.make(env.spec)
+    assert again.unwrapped.task.num_steps == env.unwrapped.task.num_steps
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_a_vector_environment_draws_its_worlds(name: str) -> None:
+    """Catches frames that all show the first world."""
+    env = make_vec(name, 2, render_mode="rgb_array", scenario="nominal")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    action[1] = 0.03
+    for _ in range(30):
+        env.step(action)
+    first, second = env.render()
+    env.close()
+    assert first.shape == second.shape == (first.shape[0], first.shape[1], 3)
+    assert not np.array_equal(first, second)
+    alone = make(name, render_mode="rgb_array", scenario="nominal")
+    alone.reset(seed=1)
+    for _ in range(30):
+        alone.step(action[1])
+    shown = np.asarray(alone.render(), dtype=np.float64)
+    assert np.abs(shown - second).max() <= 1.0  # another renderer may round another way
+    assert np.abs(shown - first).max() > 50.0
+    alone.close()
+    assert make_vec(name, 2).render() is None
