@@ -537,7 +537,7 @@ def test_learning_curves_are_shares_of_the_base_and_gaps_where_a_scenario_failed
 def test_without_plotly_the_comparison_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches minutes of work that end in an import error."""
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
-    with pytest.raises(MissingExtraError, match=r"report needs the package plotly; .*elastic-env\[report\]"):
+    with pytest.raises(MissingExtraError, match=r"report needs the package plotly; .*'\.\[report\]'"):
         require_plotly()
 
 

@@ -89,7 +89,11 @@ def run_conditions(conditions: Sequence[Condition], console: Console, jobs: int 
 
         why: list[ElasticError] = []
         try:
-            results = side_by_side(_evaluate, [(conditions[number],) for number in longest_first], jobs, advance)
+            results: list[Any]
+            if len(conditions) == 1:  # a process of its own takes seconds to start
+                results = [_evaluate(conditions[0], lambda played: advance(0, played), num_threads=jobs)]
+            else:
+                results = side_by_side(_evaluate, [(conditions[number],) for number in longest_first], jobs, advance)
         except WorkerKilledError as error:
             results = error.results
             why.append(error)
@@ -170,14 +174,16 @@ def plain_progress(console: Console, least_s: float = 0.0) -> Callable[[float], 
         least_s: Shortest time between two lines, and before the first one [s].
     """
     said, when = 0, time.monotonic()
-    begun, is_announced = when, False
+    first: tuple[float, float] | None = None  # processes take their time to start
+    is_announced = False
 
     def say(share: float) -> None:
-        nonlocal said, when, is_announced
-        elapsed = time.monotonic() - begun
-        if not is_announced and share > 0.0 and elapsed > _ANNOUNCED_S:
+        nonlocal said, when, first, is_announced
+        first = first or (time.monotonic(), share)
+        elapsed, done = time.monotonic() - first[0], share - first[1]
+        if not is_announced and done > 0.0 and elapsed > _ANNOUNCED_S:
             is_announced = True
-            if (to_go := elapsed * (1.0 - share) / share) > _LONG_S:
+            if (to_go := elapsed * (1.0 - share) / done) > _LONG_S:
                 console.print(f"  about {duration(to_go)} to go")
         if int(10 * share) > said and time.monotonic() - when >= least_s:
             said, when = int(10 * share), time.monotonic()
@@ -285,10 +291,12 @@ def _call(function: Callable[..., Any], given: tuple[Any, ...], number: int, rep
     return function(*given, lambda value: reports.put((number, value)))
 
 
-def _evaluate(condition: Condition, report: Callable[[int], None]) -> Evaluation | PolicyFailedError:
+def _evaluate(
+    condition: Condition, report: Callable[[int], None], num_threads: int = 1
+) -> Evaluation | PolicyFailedError:
     """An evaluation, or why there is none: the other conditions go on."""
     try:
-        return evaluate(condition, progress=report, num_threads=1)
+        return evaluate(condition, progress=report, num_threads=num_threads)
     except PolicyFailedError as error:
         return error.with_traceback(None)
 

@@ -40,7 +40,7 @@ class FootSensors:
         Returns:
             (n, L, 3) each [N], [N·m].
         """
-        seen, R = _rows(np.broadcast_to(sensors, (*foot_R.shape[:-2], 2, 3)), 3), _rows(foot_R, 3)
+        seen, R = _rows(sensors, (*foot_R.shape[:-2], 2, 3), 3), _rows(foot_R, foot_R.shape, 3)
         force, moment = np.empty(R.shape[:-1]), np.empty(R.shape[:-1])
         ground_wrenches(seen, R, self.com, self.weight, force, moment)
         shape = foot_R.shape[:-1]
@@ -59,13 +59,15 @@ def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float)
     Returns:
         (..., 2) [m]; nan where the feet are not loaded.
     """
-    f, n, p = (_rows(values, 2) for values in np.broadcast_arrays(force, moment, ankle))
+    shape = np.broadcast_shapes(force.shape, moment.shape, ankle.shape)
+    f, n, p = (_rows(values, shape, 2) for values in (force, moment, ankle))
     zmp = np.empty((len(f), 2))
     moment_points(f, n, p, least_n, zmp)
-    return zmp.reshape(*np.broadcast_shapes(force.shape, moment.shape, ankle.shape)[:-2], 2)
+    return zmp.reshape(*shape[:-2], 2)
 
 
-def _rows(values: Array, axes: int) -> Array:
-    """One row per robot: all but the last axes in one."""
-    # a broadcast view of one row counts as contiguous, but may not be written to, and Numba marks that
-    return np.require(values, requirements=["C", "W"]).reshape(-1, *values.shape[-axes:])
+def _rows(values: Array, shape: tuple[int, ...], axes: int) -> Array:
+    """Values of a shape with one row per robot: all but the last axes in one."""
+    if values.shape != shape:
+        values = np.broadcast_to(values, shape)  # which cannot be written to: to Numba that is another type
+    return np.require(values, requirements=["C", "W"]).reshape(-1, *shape[-axes:])
