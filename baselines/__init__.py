@@ -6,11 +6,11 @@ action, state = policy.predict(observation)
 """
 
 import elastic_env  # noqa: F401  first: it chooses MuJoCo's OpenGL before anything imports MuJoCo
-from baselines.compensated import Compensated
-from baselines.compensators import DynamicCompensator, GravityCompensator
-from baselines.correction import Corrected, ResidualSettings
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
+from baselines.compensation.policy import Policy
 from baselines.policies import RESIDUAL, make, policy_names
-from baselines.policy import Policy
+from baselines.residual.correction import Corrected, ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 
 __all__ = [

@@ -8,17 +8,17 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from baselines.compensated import Compensated
-from baselines.compensators import DynamicCompensator, GravityCompensator, OutputMethod
-from baselines.gravity_torque import GravityMethod
-from baselines.oracle import Oracle
-from baselines.policy import Policy, Zero
-from baselines.residual import RESIDUAL, read_description, residual_policy
-from baselines.walking_controller import WalkingController, WalkingGains
-from elastic_env.config import Model, quantity
-from elastic_env.errors import ConfigurationError, unknown_name
-from elastic_env.plan import STAND_S
-from elastic_env.robots.robot_model import RobotModel, WalkerModel, read_stiffness
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
+from baselines.compensation.gravity_torque import GravityMethod
+from baselines.compensation.oracle import Oracle
+from baselines.compensation.policy import Policy, Zero
+from baselines.residual.residual import RESIDUAL, read_description, residual_policy
+from baselines.walking.controller import WalkingController, WalkingGains
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.motion.trajectory import STAND_S
+from elastic_env.runtime.robot_model import RobotModel, WalkerModel, read_stiffness
 
 
 class PolicyOptions(Model):

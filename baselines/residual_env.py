@@ -15,12 +15,12 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from baselines.correction import Corrected, ResidualSettings, Space
-from baselines.features import Features
+from baselines.compensation.policy import Policy
 from baselines.policies import make
-from baselines.policy import Policy
-from elastic_env.errors import ActionError, ConfigurationError
-from elastic_env.signals import Array, BoolArray
+from baselines.residual.correction import Corrected, ResidualSettings, Space
+from baselines.residual.features import Features
+from elastic_env.core.errors import ActionError, ConfigurationError
+from elastic_env.core.signals import Array, BoolArray
 
 
 class _Deciding:
@@ -76,7 +76,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
     Args:
         env: An environment of ours.
         base_policy: A policy for it, or the name of one.
-        space: "model" or "joint", see `baselines.correction`.
+        space: "model" or "joint", see `baselines.residual.correction`.
         scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
             by the end of their names; None for 0.6 or 0.02 rad.
         decision_period: Control steps per decision.
@@ -136,7 +136,7 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     Args:
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
-        space: "model" or "joint", see `baselines.correction`.
+        space: "model" or "joint", see `baselines.residual.correction`.
         scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
             by the end of their names; None for 0.6 or 0.02 rad.
         decision_period: Control steps per decision.

@@ -4,11 +4,33 @@ import gymnasium, elastic_env
 env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=3.0, scenario="nominal")
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
 
-from elastic_env.headless import prefer_egl
+from elastic_env.rendering.headless import prefer_egl
+
+if TYPE_CHECKING:
+    from elastic_env.joint.elasticity import ElasticJoint, Servo
+    from elastic_env.joint.make_elastic import make_elastic
 
 __version__ = "0.1.0"
+__all__ = ["ElasticJoint", "Servo", "make_elastic"]
+
+_HOMES = {
+    "ElasticJoint": "elastic_env.joint.elasticity",
+    "Servo": "elastic_env.joint.elasticity",
+    "make_elastic": "elastic_env.joint.make_elastic",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Public names when they are asked for: a process beside the control loop imports this package too."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
 
 prefer_egl()
 gymnasium.register(
@@ -18,8 +40,8 @@ gymnasium.register(
 )
 gymnasium.register(
     id="elastic_env/HardwareTestbed-v0",
-    entry_point="elastic_env.hardware.entry_points:make_hardware_testbed",
-    vector_entry_point="elastic_env.hardware.entry_points:make_hardware_testbed_vector",
+    entry_point="elastic_env.hardware.testbed.entry_points:make_hardware_testbed",
+    vector_entry_point="elastic_env.hardware.testbed.entry_points:make_hardware_testbed_vector",
 )
 gymnasium.register(
     id="elastic_env/WalkInPlace-v0",

@@ -9,21 +9,22 @@ from typing import Any, Literal, TypeVar
 
 from gymnasium.vector import AutoresetMode
 
-from elastic_env.elasticity import ElasticJoint
-from elastic_env.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.errors import ConfigurationError, shown, unknown_name
-from elastic_env.references import AnyReference, make_reference
-from elastic_env.rendering import TestbedPicture, WalkerPicture
-from elastic_env.robots.dynamixel import H54_200_S500_R
-from elastic_env.robots.robot_model import read_stiffness, with_stiffness
-from elastic_env.robots.testbed import Pendulum
-from elastic_env.robots.thormang import Thormang
-from elastic_env.scenario import Scenario, make_scenario
-from elastic_env.tasks.testbed import TestbedTask
-from elastic_env.tasks.testbed_config import RewardWeights, TestbedConfig
-from elastic_env.tasks.walk_config import WalkConfig, WalkRewardWeights
-from elastic_env.tasks.walk_in_place import WalkTask
-from elastic_env.walking.gait import Gait, make_gait
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.joint.dynamixel import H54_200_S500_R
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.motion.gait import Gait, make_gait
+from elastic_env.motion.references import AnyReference, make_reference
+from elastic_env.robots.testbed.config import RewardWeights, TestbedConfig
+from elastic_env.robots.testbed.model import Pendulum
+from elastic_env.robots.testbed.picture import TestbedPicture
+from elastic_env.robots.testbed.task import TestbedTask
+from elastic_env.robots.thormang.config import WalkConfig, WalkRewardWeights
+from elastic_env.robots.thormang.model import Thormang
+from elastic_env.robots.thormang.picture import WalkerPicture
+from elastic_env.robots.thormang.task import WalkTask
+from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.runtime.robot_model import read_stiffness, with_stiffness
+from elastic_env.runtime.scenario import Scenario, make_scenario
 
 ConfigT = TypeVar("ConfigT")
 
@@ -45,7 +46,7 @@ def configure_testbed(
 
     Args:
         reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a reference model.
-        scenario: Name as in `elastic_env.scenario`, or a `Scenario`.
+        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
         stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that of the joint.
         joint: Elastic joint, or a mapping of what differs from the paper's H54-200-S500-R, the default.
         pendulum: The load, or a mapping of what differs from the default of 60 N·m at the horizontal.
@@ -91,7 +92,7 @@ def configure_walk(
     Args:
         step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support [s], or a `Gait`.
         num_steps: Number of steps; default 4, or that of the `Gait`.
-        scenario: Name as in `elastic_env.scenario`, or a `Scenario`.
+        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
         stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an `identification.json`; default
             that of the joints.
         joint: Elastic joint for all twelve, or a mapping of what differs from the paper's H54-200-S500-R, the default.

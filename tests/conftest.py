@@ -4,7 +4,7 @@ import signal
 
 from hypothesis import settings
 
-from elastic_env.headless import prefer_egl
+from elastic_env.rendering.headless import prefer_egl
 
 prefer_egl()
 # a shell's background jobs ignore Ctrl-C, and so would the programs that tests start and interrupt

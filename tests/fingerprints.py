@@ -22,7 +22,7 @@ import numpy as np
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.policies import policy_names
-from elastic_env.scenario import scenario_names
+from elastic_env.runtime.scenario import scenario_names
 
 RECORDED = Path(__file__).with_name("fingerprints.json")
 STEPS, WORLDS = 300, 7

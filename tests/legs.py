@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import LegChains, LegLoads
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_chains import LegChains, LegLoads
 
 
 def foot_frames(chains: LegChains, q: Array) -> tuple[Array, Array]:

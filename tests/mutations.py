@@ -19,14 +19,14 @@ from typing import Any
 import yaml
 
 from baselines.policies import RESIDUAL
-from elastic_env.config import load_yaml
-from elastic_env.errors import ElasticError
-from elastic_env.yaml_text import parse_yaml
-from train.bench import BenchConfig
-from train.compare import CompareConfig, try_out
-from train.conditions import PolicySpec
-from train.families import expand, origin
-from train.train_config import TrainConfig, training_worlds
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ElasticError
+from elastic_env.core.yaml_text import parse_yaml
+from train.evaluate.conditions import PolicySpec
+from train.evaluate.families import expand, origin
+from train.experiments.bench import BenchConfig
+from train.experiments.compare import CompareConfig, try_out
+from train.learn.train_config import TrainConfig, training_worlds
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))

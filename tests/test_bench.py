@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 import yaml
 
-from elastic_env.config import load_yaml
-from elastic_env.errors import ConfigurationError
-from train.bench import BenchConfig, configuration
-from train.cli import main
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError
+from train.commands.cli import main
+from train.experiments.bench import BenchConfig, configuration
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}

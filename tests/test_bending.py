@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver, _least_squares
-from elastic_env.signals import Array
+from baselines.estimation.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver, _least_squares
+from elastic_env.core.signals import Array
 
 
 def walker(scenario: str, num_envs: int = 2) -> Any:

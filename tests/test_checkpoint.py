@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from elastic_env.errors import ElasticError
+from elastic_env.core.errors import ElasticError
 from tests.test_training import PPO, SMALL, interrupted_after
-from train.checkpoint import recovered, require_whole, written
-from train.failures import SYSTEM_FAILED, explained
-from train.learn import Training
-from train.train_config import TrainConfig
+from train.learn.checkpoint import recovered, require_whole, written
+from train.learn.train_config import TrainConfig
+from train.learn.training import Training
+from train.runs.failures import SYSTEM_FAILED, explained
 
 MUTATIONS, FULL_DISKS = 300, 4
 

@@ -17,23 +17,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-import train.compare
-from baselines.residual import ResidualDescription, read_description
-from elastic_env.config import load_yaml
-from elastic_env.errors import ConfigurationError, MissingExtraError
-from train.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
-from train.changes_tables import changes_table, write_statistics
-from train.cli import main
-from train.compare import CompareConfig
-from train.conditions import Condition, Member, PolicySpec
-from train.evaluate import Evaluation, evaluate
-from train.families import expand
-from train.figures import has_swept_references
-from train.progress import learning_curves
+import train.experiments.compare
+from baselines.residual.residual import ResidualDescription, read_description
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError, MissingExtraError
+from train.commands.cli import main
+from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
+from train.evaluate.conditions import Condition, Member, PolicySpec
+from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.families import expand
+from train.evaluate.progress import learning_curves
+from train.evaluate.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
+from train.experiments.compare import CompareConfig
+from train.figures.figures import has_swept_references
 from train.report import Results, require_plotly, write_report
+from train.report.changes_tables import changes_table, write_statistics
 from train.report.page import changes_html
-from train.runs import run_folder
-from train.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
+from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
@@ -559,7 +559,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
         patch.chdir(root)
-        patch.setattr(train.compare, "run_conditions", run)
+        patch.setattr(train.experiments.compare, "run_conditions", run)
         patch.setattr("train.commands.playing.CONSOLE", Console(width=160, file=file))
         main(["compare", "two.yaml"])
     return root / "runs" / "two", (root / "printed.txt").read_text()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines.compensators import (
+from baselines.compensation.compensators import (
     DynamicCompensator,
     GravityCompensator,
     Motion,
@@ -16,14 +16,14 @@ from baselines.compensators import (
     newton_link_angle,
     taylor_link_angle,
 )
-from baselines.gravity_torque import RigidBody, make_gravity
-from elastic_env.elasticity import ElasticJoint, Servo
-from elastic_env.errors import ConfigurationError, ElasticError
-from elastic_env.robots.robot_model import RobotModel
-from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec, rigid_spec
-from elastic_env.signals import Array
+from baselines.compensation.gravity_torque import RigidBody, make_gravity
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
+from elastic_env.runtime.robot_model import RobotModel
 from tests.trees import bias_of_mujoco, pendulum, robot, tree
-from train.evaluate import Condition, PolicySpec, evaluate
+from train.evaluate.evaluate import Condition, PolicySpec, evaluate
 
 G = 60.0  # torque of the pendulum at the horizontal [N·m]
 STIFFNESSES = pytest.mark.parametrize("K", [1001.0, 300.0])

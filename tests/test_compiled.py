@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env import compiled as module
-from elastic_env import metrics, worlds
-from elastic_env.compiled import compile_now, compiled
-from elastic_env.walking import kernels
+from elastic_env.core import compiled as module
+from elastic_env.core.compiled import compile_now, compiled
+from elastic_env.dynamics import walk_kernels as kernels
+from elastic_env.runtime import metrics, worlds
 
 ROOT = Path(__file__).parents[1]
-KERNELS = ("elastic_env.worlds", "elastic_env.metrics", "elastic_env.walking.kernels")
+KERNELS = ("elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels")
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -52,7 +52,7 @@ def test_every_compiled_function_is_looked_at() -> None:
     files = [file for package in ("elastic_env", "baselines", "train") for file in (ROOT / package).rglob("*.py")]
     found = {file for file in files if "\n@compiled" in file.read_text() or "numba.njit" in file.read_text()}
     known = {ROOT / f"{name.replace('.', '/')}.py" for name in KERNELS}
-    assert found - {ROOT / "elastic_env" / "compiled.py"} == known
+    assert found - {ROOT / "elastic_env" / "core" / "compiled.py"} == known
 
 
 def test_where_nothing_can_be_kept_it_works_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,7 +98,7 @@ def test_without_the_compiler_it_works_all_the_same() -> None:
 
 USERS = """
 import numba
-from elastic_env.compiled import compiled
+from elastic_env.core.compiled import compiled
 
 @compiled
 def twice(value):

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from baselines.correction import ResidualSettings
 from baselines.policies import PolicyOptions
-from elastic_env.config import Model, load_yaml, quantity
+from baselines.residual.correction import ResidualSettings
+from elastic_env.core.config import Model, load_yaml, quantity
+from elastic_env.core.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
+from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.entry_points import configure_testbed, configure_walk
-from elastic_env.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
-from elastic_env.tasks.testbed_config import TestbedConfig
-from elastic_env.yaml_text import parse_yaml
-from train.compare import CompareConfig
-from train.train_config import TrainConfig
+from elastic_env.robots.testbed.config import TestbedConfig
+from train.experiments.compare import CompareConfig
+from train.learn.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))

@@ -12,20 +12,20 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensators import GravityCompensator, taylor_link_angle
-from baselines.contact_torque import PlannedTorque, WrenchTorque, gravity_in_pelvis
-from baselines.gravity_torque import GravityModel, make_gravity
-from elastic_env.errors import ConfigurationError
-from elastic_env.rigid_body import FloatingBody
-from elastic_env.robots.joint_names import JointAddresses
-from elastic_env.robots.robot_model import WalkerModel
-from elastic_env.robots.thormang import ANKLE_HEIGHT_M, LEG, LEG_JOINTS
-from elastic_env.scenario import make_scenario
-from elastic_env.signals import Array
-from elastic_env.tasks.walk_config import WalkConfig
-from elastic_env.tasks.walk_in_place import WalkTask
-from elastic_env.walking.kernels import attitude_of
-from elastic_env.walking.leg_kinematics import foot_pose
+from baselines.compensation.compensators import GravityCompensator, taylor_link_angle
+from baselines.compensation.contact_torque import PlannedTorque, WrenchTorque, gravity_in_pelvis
+from baselines.compensation.gravity_torque import GravityModel, make_gravity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_kinematics import foot_pose
+from elastic_env.dynamics.rigid_body import FloatingBody
+from elastic_env.dynamics.walk_kernels import attitude_of
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.robots.thormang.config import WalkConfig
+from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS
+from elastic_env.robots.thormang.task import WalkTask
+from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.runtime.scenario import make_scenario
 from tests.trees import pendulum
 
 WEIGHT_N = 57.0 * 9.81

@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from elastic_env.elasticity import ElasticJoint, Servo
-from elastic_env.errors import ConfigurationError
-from elastic_env.robots.dynamixel import H54_200_S500_R
-from elastic_env.robots.elastic_joint import Form, make_elastic
-from elastic_env.robots.joint_names import JointAddresses, link_name, motor_name, servo_name, spring_name
-from elastic_env.robots.testbed import JOINT, Pendulum, elastic_spec, rigid_spec
-from elastic_env.signals import Array
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.joint.dynamixel import H54_200_S500_R
+from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.joint_names import JointAddresses, link_name, motor_name, servo_name, spring_name
+from elastic_env.joint.make_elastic import Form, make_elastic
+from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
 from tests.foreign import ARM, FOUR_BAR, MODELS, QUADRUPED, ROVER
 
 PENDULUM = Pendulum()

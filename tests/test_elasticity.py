@@ -8,10 +8,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import optimize
 
-from elastic_env.elasticity import ElasticJoint, joint_torque, solve_stiffness, static_deflection, static_link_angle
-from elastic_env.errors import ConfigurationError, ElasticError
-from elastic_env.robots.testbed import Pendulum
-from elastic_env.signals import Array
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import (
+    ElasticJoint,
+    joint_torque,
+    solve_stiffness,
+    static_deflection,
+    static_link_angle,
+)
+from elastic_env.robots.testbed.model import Pendulum
 
 PENDULUM = Pendulum()
 

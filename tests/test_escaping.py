@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train.escaping import chart_text, csv_row, markdown_table, script_json
+from train.runs.escaping import chart_text, csv_row, markdown_table, script_json
 
 NASTY = [
     "<!--<script>", "</script><b>", "a|b", "a\nb", "=cmd|' /C calc'!A0", "-1+2", "@x", "\tx", "&lt;", "\u2028", "ok",

@@ -9,12 +9,12 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.correction import Corrected, ResidualSettings
-from baselines.evidence import ERROR_SCALE, LOAD_SCALE, Evidence, evidence
-from baselines.features import Features
-from baselines.residual import Network, ResidualDescription, ResidualPolicy
+from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.evidence import ERROR_SCALE, LOAD_SCALE, Evidence, evidence
+from baselines.residual.features import Features
+from baselines.residual.residual import Network, ResidualDescription, ResidualPolicy
 from baselines.residual_env import ResidualWrapper
-from elastic_env.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError
 
 HIP_ROLLS, PERIOD = [1, 7], 25
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from elastic_env.errors import ConfigurationError, SystemFailedError
-from train.failures import explained
-from train.workers import WorkerKilledError, duration, plain_progress
+from elastic_env.core.errors import ConfigurationError, SystemFailedError
+from train.runs.failures import explained
+from train.runs.workers import WorkerKilledError, duration, plain_progress
 
 POLICIES = """
 import numpy as np
@@ -50,7 +50,7 @@ policies: [input, "mine.py:raises"]
 
 
 def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from train.entry import main; main()", *arguments]
+    command = [sys.executable, "-c", "from train.commands.entry import main; main()", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)  # type: ignore[call-overload]
 
 
@@ -116,7 +116,7 @@ def test_what_had_been_played_before_a_worker_was_killed_is_kept(tmp_path: Path)
 
 def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
     """Catches BrokenPipeError, also where the interpreter flushes at its end."""
-    code = f"{sys.executable} -c 'from train.entry import main; main()' evaluate --help"
+    code = f"{sys.executable} -c 'from train.commands.entry import main; main()' evaluate --help"
     run = subprocess.run(f"{code} | head -n 1", shell=True, capture_output=True, text=True, timeout=120, check=True)
     assert "Traceback" not in run.stderr
     assert "BrokenPipe" not in run.stderr
@@ -124,7 +124,11 @@ def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
 
 def test_an_interrupt_while_modules_load_is_one_word() -> None:
     """Catches a traceback through the imports."""
-    command = [sys.executable, "-c", "import sys; sys.argv[1:] = ['demo']; from train.entry import main; main()"]
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; sys.argv[1:] = ['demo']; from train.commands.entry import main; main()",
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as program:
         time.sleep(0.6)
         program.send_signal(signal.SIGINT)

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.signals import Array, BoolArray
-from elastic_env.walking.gait import Gait, Timing, make_gait, step_timing, zmp_reference
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.motion.gait import Gait, Timing, make_gait, step_timing, zmp_reference
 
 PERIOD_S = 0.004
 STAND = 250  # control steps of standing before and after the walk

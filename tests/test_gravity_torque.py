@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from baselines.gravity_torque import BatchedGravity, GravityModel, HingeTorque, make_gravity
-from elastic_env.errors import ConfigurationError
-from elastic_env.rigid_body import RigidBody
-from elastic_env.robots.robot_model import RobotModel
-from elastic_env.signals import Array
+from baselines.compensation.gravity_torque import BatchedGravity, GravityModel, HingeTorque, make_gravity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.runtime.robot_model import RobotModel
 from tests.trees import ORDER, TREE, bias_of_mujoco, pendulum, robot, tree
 
 METHODS = ("pinocchio", "batched")

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.bending import BendingObserver
-from baselines.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel
-from elastic_env.signals import Array
-from elastic_env.walking.ground_contact import zero_moment_point
+from baselines.estimation.bending import BendingObserver
+from baselines.estimation.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.ground_contact import zero_moment_point
 
 PERIOD_S = 0.1
 

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastic_env.hardware import attitude, supervisor
-from elastic_env.hardware.attitude import AttitudeError, AttitudeStream
-from elastic_env.hardware.attitude_sample import Attitude, PlausibleAttitudes
-from elastic_env.hardware.bounds import exceeds, is_outside
 from elastic_env.hardware.errors import FaultError, HardwareError
-from elastic_env.hardware.realtime import Pace
-from elastic_env.hardware.safety import Guard, SafetyLimits
+from elastic_env.hardware.imu import attitude
+from elastic_env.hardware.imu.attitude import AttitudeError, AttitudeStream
+from elastic_env.hardware.imu.attitude_sample import Attitude, PlausibleAttitudes
+from elastic_env.hardware.safety import supervisor
+from elastic_env.hardware.safety.bounds import exceeds, is_outside
+from elastic_env.hardware.safety.limits import Guard, SafetyLimits
+from elastic_env.hardware.safety.realtime import Pace
 from tests.test_hardware_safety import states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import StillBus, make_still, still  # noqa: F401  a fixture

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.hardware import protocol
-from elastic_env.hardware.control_table import servo_model
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults, damage
 from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.servo import EmulatedServo, MotorAtRest
 from elastic_env.hardware.emulator.wire import EmulatedBus
-from elastic_env.hardware.protocol import Packet, Parser
-from elastic_env.plan import quintic
-from elastic_env.scenario import make_scenario
-from elastic_env.tasks.testbed_config import TestbedConfig
+from elastic_env.hardware.servo_bus import protocol
+from elastic_env.hardware.servo_bus.control_table import servo_model
+from elastic_env.hardware.servo_bus.protocol import Packet, Parser
+from elastic_env.motion.trajectory import quintic
+from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.runtime.scenario import make_scenario
 
 
 def make_servo(number: int = 54024, servo_id: int = 1) -> EmulatedServo:

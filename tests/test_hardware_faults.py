@@ -13,19 +13,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastic_env.hardware import plant, supervised
-from elastic_env.hardware.bus import TEMPERATURE_CYCLES
-from elastic_env.hardware.channel import LONGEST_WAIT_S
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
-from elastic_env.hardware.safety import Guard, SafetyLimits
-from elastic_env.hardware.supervised import SupervisedBus
+from elastic_env.hardware.safety import supervised
+from elastic_env.hardware.safety.channel import LONGEST_WAIT_S
+from elastic_env.hardware.safety.limits import Guard, SafetyLimits
+from elastic_env.hardware.safety.supervised import SupervisedBus
+from elastic_env.hardware.servo_bus.bus import TEMPERATURE_CYCLES
+from elastic_env.hardware.testbed import plant
 from tests.busy import once_more
 from tests.test_hardware_safety import PATIENT, states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import make_hardware
-from train.cli import main
+from train.commands.cli import main
 
 PERIOD_S = 0.004
 STOP_CYCLES = 60

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from elastic_env.hardware.attitude import AttitudeStream
-from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.emulator.running import RunningEmulator
-from elastic_env.hardware.supervised import SupervisedBus
+from elastic_env.hardware.imu.attitude import AttitudeStream
+from elastic_env.hardware.safety.child_process import child_command, child_environment
+from elastic_env.hardware.safety.supervised import SupervisedBus
 from tests.busy import once_more
 
 PLANTED = (
@@ -48,7 +48,7 @@ def test_nothing_of_the_working_directory_runs_in_a_child(
         with AttitudeStream(emulator.imu_port, oldest_s=0.5) as stream:
             stream.latest()
         done = subprocess.run(
-            child_command("train.wave", "/dev/ttyNOTHING", "1"), env=child_environment(), capture_output=True,
+            child_command("train.hardware.wave", "/dev/ttyNOTHING", "1"), env=child_environment(), capture_output=True,
             text=True, timeout=60, check=False,
         )  # fmt: skip
     assert "/dev/ttyNOTHING: there is no such device" in done.stdout
@@ -58,7 +58,7 @@ def test_nothing_of_the_working_directory_runs_in_a_child(
 def test_planted_modules_are_found_by_python_m(tmp_path: Path) -> None:
     """Catches planted modules that nothing would ever import, with which the test above could not fail."""
     said = plant(tmp_path)
-    command = [sys.executable, "-m", "elastic_env.hardware.supervisor", "0", "0"]
+    command = [sys.executable, "-m", "elastic_env.hardware.safety.supervisor", "0", "0"]
     assert subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60, check=False).returncode == 9
     assert said.exists()
 
@@ -71,8 +71,8 @@ def test_packages_of_the_users_path_are_found(tmp_path: Path, monkeypatch: pytes
     for given in (tmp_path / "packages", "packages"):
         monkeypatch.setenv("PYTHONPATH", f"{given}{os.pathsep}.")
         done = subprocess.run(
-            child_command("elastic_env.hardware.port"), env=child_environment(), capture_output=True, text=True,
-            timeout=60, check=False,
+            child_command("elastic_env.hardware.servo_bus.port"), env=child_environment(), capture_output=True,
+            text=True, timeout=60, check=False,
         )  # fmt: skip
         assert "from the path" in done.stderr
 

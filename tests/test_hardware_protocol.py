@@ -9,14 +9,14 @@ from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.hardware import protocol
-from elastic_env.hardware.bus import Bus
-from elastic_env.hardware.control_table import NUM_BLOCKS, explain_errors, servo_model, servo_models
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.emulator.mip import attitude_packet, checksum
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.safety import SafetyLimits
-from elastic_env.hardware.torque_line import current_of_torque, torque_of_current
+from elastic_env.hardware.safety.limits import SafetyLimits
+from elastic_env.hardware.servo_bus import protocol
+from elastic_env.hardware.servo_bus.bus import Bus
+from elastic_env.hardware.servo_bus.control_table import NUM_BLOCKS, explain_errors, servo_model, servo_models
+from elastic_env.hardware.servo_bus.torque_line import current_of_torque, torque_of_current
 
 # of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
 EXAMPLES = [

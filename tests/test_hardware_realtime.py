@@ -11,18 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from elastic_env.hardware import realtime
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import FaultError
-from elastic_env.hardware.realtime import Pace, Priority, give_up_realtime, prefer_realtime
-from elastic_env.hardware.safety import SafetyLimits
-from elastic_env.hardware.supervised import SupervisedBus
+from elastic_env.hardware.safety import realtime
+from elastic_env.hardware.safety.limits import SafetyLimits
+from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
+from elastic_env.hardware.safety.supervised import SupervisedBus
 from tests.busy import once_more
 
 BUSY_S = 0.5
 BUSY_PROGRAM = f"""
 import sys, time
-from elastic_env.hardware.realtime import Priority, prefer_realtime
+from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 prefer_realtime(Priority.LOOP)
 print("ready", flush=True)
 end = float(sys.stdin.readline()) + {BUSY_S}

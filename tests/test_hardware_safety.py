@@ -13,16 +13,16 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.hardware.attitude import AttitudeStream
-from elastic_env.hardware.bus import Bus, Buses, States
-from elastic_env.hardware.checks import check_bus
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
-from elastic_env.hardware.port import Port
-from elastic_env.hardware.safety import Guard, SafetyLimits
-from elastic_env.hardware.supervised import SupervisedBus
+from elastic_env.hardware.imu.attitude import AttitudeStream
+from elastic_env.hardware.safety.checks import check_bus
+from elastic_env.hardware.safety.limits import Guard, SafetyLimits
+from elastic_env.hardware.safety.supervised import SupervisedBus
+from elastic_env.hardware.servo_bus.bus import Bus, Buses, States
+from elastic_env.hardware.servo_bus.port import Port
 from tests.busy import once_more
 
 PERIOD_S = 0.004
@@ -360,7 +360,7 @@ def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
 @pytest.mark.parametrize("how", ["kill", "stop", "interrupt", "kill-supervisor"])
 def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:
     """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of the supervisor."""
-    command = [sys.executable, "-m", "train.wave", emulator.port, "1"]
+    command = [sys.executable, "-m", "train.hardware.wave", emulator.port, "1"]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
         assert program.stdout is not None

@@ -11,17 +11,18 @@ from typing import Any
 
 import pytest
 
-from elastic_env.hardware import protocol, supervised, supervisor
-from elastic_env.hardware.bus import Bus
-from elastic_env.hardware.channel import Channel
-from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.servo import EmulatedServo, MotorAtRest
 from elastic_env.hardware.emulator.wire import EmulatedBus
 from elastic_env.hardware.errors import BusGoneError, ReplyError
-from elastic_env.hardware.protocol import Packet, Parser
-from elastic_env.hardware.safety import SafetyLimits
-from elastic_env.hardware.supervised import emergency_stop
-from elastic_env.hardware.supervisor import Supervisor
+from elastic_env.hardware.safety import supervised, supervisor
+from elastic_env.hardware.safety.channel import Channel
+from elastic_env.hardware.safety.limits import SafetyLimits
+from elastic_env.hardware.safety.supervised import emergency_stop
+from elastic_env.hardware.safety.supervisor import Supervisor
+from elastic_env.hardware.servo_bus import protocol
+from elastic_env.hardware.servo_bus.bus import Bus
+from elastic_env.hardware.servo_bus.control_table import servo_model
+from elastic_env.hardware.servo_bus.protocol import Packet, Parser
 
 MODEL = servo_model(54024)
 ENABLE = ("enable", {"limits": SafetyLimits().model_dump()})

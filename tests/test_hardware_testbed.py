@@ -20,22 +20,23 @@ import numpy as np
 import pytest
 
 import baselines
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.entry_points import configure_testbed
-from elastic_env.errors import ConfigurationError
-from elastic_env.hardware import plant, realtime
-from elastic_env.hardware.attitude import Attitude, AttitudeError, AttitudeStream, SharedSample, link_angle
-from elastic_env.hardware.bus import States
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import HardwareError, PortError
-from elastic_env.hardware.settings import HardwareSettings
-from elastic_env.hardware.supervised import Cycle
-from elastic_env.hardware.torque_line import torque_of_current
+from elastic_env.hardware.imu.attitude import Attitude, AttitudeError, AttitudeStream, SharedSample, link_angle
+from elastic_env.hardware.safety import realtime
+from elastic_env.hardware.safety.supervised import Cycle
+from elastic_env.hardware.servo_bus.bus import States
+from elastic_env.hardware.servo_bus.torque_line import torque_of_current
+from elastic_env.hardware.testbed import plant
+from elastic_env.hardware.testbed.settings import HardwareSettings
 from tests.busy import once_more
-from train import hardware_trials
-from train.cli import main
-from train.hardware import hardware_arguments
-from train.identify import IdentifyConfig, identified_environments
+from train.commands.cli import main
+from train.experiments.identify import IdentifyConfig, identified_environments
+from train.hardware import trials as hardware_trials
+from train.hardware.session import hardware_arguments
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
 PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
@@ -394,7 +395,15 @@ def test_an_interrupted_run_keeps_its_steps_and_says_that_torque_is_off(
     mounting = tmp_path / "mounting.yaml"
     mounting.write_text("approach_rad_s: 2.0\nlimits: {patience_cycles: 10, hang_s: 0.09}\n")
     command = [
-        *(sys.executable, "-c", "from train.cli import main; main()", "hardware", "run", "--port", emulator.port),
+        *(
+            sys.executable,
+            "-c",
+            "from train.commands.cli import main; main()",
+            "hardware",
+            "run",
+            "--port",
+            emulator.port,
+        ),
         *("--mounting", str(mounting), "--yes", "--reference", "sine", "--output", str(tmp_path / "run")),
     ]
     with subprocess.Popen(

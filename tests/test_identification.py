@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import baselines.identification as identification
-from baselines.gravity_torque import GravityModel, make_gravity
-from baselines.identification import Identification, identify, identify_points
-from baselines.static_points import HoldRecorder, StaticPoints, record_points
-from elastic_env.errors import ConfigurationError, ElasticError
-from elastic_env.references import Hold
-from elastic_env.robots.dynamixel import H54_200_S500_R
-from elastic_env.robots.testbed import Pendulum
-from elastic_env.scenario import make_scenario
-from elastic_env.signals import Array
+import baselines.identification.identify as identification
+from baselines.compensation.gravity_torque import GravityModel, make_gravity
+from baselines.identification.identify import Identification, identify, identify_points
+from baselines.identification.static_points import HoldRecorder, StaticPoints, record_points
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
+from elastic_env.joint.dynamixel import H54_200_S500_R
+from elastic_env.motion.references import Hold
+from elastic_env.robots.testbed.model import Pendulum
+from elastic_env.runtime.scenario import make_scenario
 from tests.trees import pendulum
-from train.compare import run_conditions
-from train.evaluate import Condition, Evaluation, PolicySpec
+from train.evaluate.evaluate import Condition, Evaluation, PolicySpec
+from train.experiments.compare import run_conditions
 
 ID = "elastic_env/Testbed-v0"
 G = 60.0  # torque of the pendulum at the horizontal [N·m]

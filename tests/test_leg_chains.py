@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.rigid_body import FloatingBody
-from elastic_env.robots.thormang import LEG_JOINTS, Thormang, biped
-from elastic_env.signals import Array
-from elastic_env.walking.leg_chains import LegChains, LegLoads
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_chains import LegChains, LegLoads
+from elastic_env.dynamics.rigid_body import FloatingBody
+from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, biped
 from tests.legs import foot_frames, holding_torque
 
 ROBOT = biped(Thormang())

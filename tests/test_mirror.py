@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines.correction import Corrected, ResidualSettings
-from baselines.features import Features
-from baselines.mirror import Mirror
-from elastic_env.errors import ConfigurationError
-from elastic_env.robots.robot_model import WalkerModel
-from elastic_env.signals import Array
+from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.features import Features
+from baselines.residual.mirror import Mirror
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.runtime.robot_model import WalkerModel
 
 MODEL_SPACE: dict[str, Any] = {"shared": True, "decision_period": 1}
 

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from baselines.residual import load_residual, read_description
-from elastic_env.config import load_yaml
-from elastic_env.errors import ConfigurationError, shown
-from elastic_env.json_text import parse_json
-from elastic_env.simulation import substeps
+from baselines.residual.residual import load_residual, read_description
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.json_text import parse_json
+from elastic_env.runtime.physics import substeps
 from tests.mutations import RESIDUALS
-from train.bench import BenchConfig
-from train.compare import CompareConfig
-from train.conditions import PolicySpec
-from train.evaluate import make_policy
-from train.families import expand
-from train.kinds import TELLING
-from train.train_config import TrainConfig, training_worlds
+from train.evaluate.conditions import PolicySpec
+from train.evaluate.evaluate import make_policy
+from train.evaluate.families import expand
+from train.experiments.bench import BenchConfig
+from train.experiments.compare import CompareConfig
+from train.learn.train_config import TrainConfig, training_worlds
+from train.runs.kinds import TELLING
 
 ROOT = Path(__file__).parents[1]
 CASES, LONGEST_S, MOST_BYTES = 2000, 300, 2 * 10**9

@@ -16,11 +16,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensators import GravityCompensator
-from baselines.policy import Zero
-from baselines.walking_controller import WalkingGains
-from elastic_env.errors import ConfigurationError, ElasticError
-from elastic_env.signals import Array
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.policy import Zero
+from baselines.walking.controller import WalkingGains
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
 
 ID = "elastic_env/Testbed-v0"
 SHORT = {"kind": "multisine", "amplitude": 0.01, "middle": 0.4, "duration_s": 0.1, "onset_s": 0.1}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize
 
-from elastic_env.errors import ElasticError
-from elastic_env.walking.preview_control import PreviewConfig, cart_table, follow_zmp, preview_gains
+from elastic_env.core.errors import ElasticError
+from elastic_env.motion.preview_control import PreviewConfig, cart_table, follow_zmp, preview_gains
 
 CONFIG = PreviewConfig(com_height_m=0.73)
 

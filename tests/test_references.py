@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.plan import STAND_S, Plan, quintic
-from elastic_env.references import REFERENCES, Hold, Multisine, Reference, Sine, Steps, make_reference
-from elastic_env.signals import Array
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.motion.references import REFERENCES, Hold, Multisine, Reference, Sine, Steps, make_reference
+from elastic_env.motion.trajectory import STAND_S, Plan, quintic
 
 PERIOD_S = 0.004
 ALL = {

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.errors import ConfigurationError
-from elastic_env.rendering import EXAGGERATION, LARGEST_FACTOR, TestbedPicture, WalkerPicture, exaggerated
-from elastic_env.rendering.walker import Posture, enlarged
-from elastic_env.robots.testbed import Pendulum
-from elastic_env.signals import Array, Signals
-from elastic_env.tasks.walk_config import WalkConfig
-from elastic_env.tasks.walk_in_place import WalkTask
-from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, Signals
+from elastic_env.dynamics.leg_kinematics import rotation_x, rotation_y
+from elastic_env.robots.testbed.model import Pendulum
+from elastic_env.robots.testbed.picture import EXAGGERATION, TestbedPicture, exaggerated
+from elastic_env.robots.thormang.config import WalkConfig
+from elastic_env.robots.thormang.picture import LARGEST_FACTOR, Posture, WalkerPicture, enlarged
+from elastic_env.robots.thormang.task import WalkTask
 
 ID = "elastic_env/Testbed-v0"
 WALKER_ID = "elastic_env/WalkInPlace-v0"

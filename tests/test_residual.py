@@ -18,10 +18,10 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
-from baselines.bending import BendingObserver
-from baselines.correction import Corrected, ResidualSettings
-from baselines.features import Features
-from baselines.residual import (
+from baselines.estimation.bending import BendingObserver
+from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.features import Features
+from baselines.residual.residual import (
     Network,
     ResidualDescription,
     ResidualPolicy,
@@ -31,11 +31,11 @@ from baselines.residual import (
     shipped,
 )
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
-from elastic_env.errors import ActionError, ConfigurationError
-from elastic_env.signals import Array
-from train.cli import main
-from train.export import network_of
-from train.sb3_env import SB3VecEnv
+from elastic_env.core.errors import ActionError, ConfigurationError
+from elastic_env.core.signals import Array
+from train.commands.cli import main
+from train.learn.export import network_of
+from train.learn.sb3_env import SB3VecEnv
 
 WALKER, TESTBED = "elastic_env/WalkInPlace-v0", "elastic_env/Testbed-v0"
 QUICK = {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
@@ -333,7 +333,7 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     Path("c.yaml").write_text(json.dumps(given))
     arguments = ["export", "mine.zip", "c.yaml", "--normaliser", "normaliser.pkl"]
     loaded = []
-    monkeypatch.setattr("train.export.algorithm_class", lambda name: loaded.append(name) or PPO)
+    monkeypatch.setattr("train.learn.export.algorithm_class", lambda name: loaded.append(name) or PPO)
     with pytest.raises(SystemExit):
         main(arguments)
     assert "--trust-pickle" in capsys.readouterr().err

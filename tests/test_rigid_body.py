@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.rigid_body import FloatingBody, RigidBody
-from elastic_env.robots.testbed import JOINT, Pendulum, rigid_spec
-from elastic_env.signals import Array
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.rigid_body import FloatingBody, RigidBody
+from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
 
 PENDULUM = Pendulum()
 BODIES = 6

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from elastic_env.errors import ConfigurationError, SystemFailedError
-from train.run_training import resume
-from train.runs import free_folder, locked, new_run
+from elastic_env.core.errors import ConfigurationError, SystemFailedError
+from train.learn.run_training import resume
+from train.runs.folders import free_folder, locked, new_run
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +59,7 @@ def test_what_is_in_the_way_is_said(obstacle: str, tmp_path: Path) -> None:
 HOLD = """
 import sys
 from pathlib import Path
-from train.runs import locked
+from train.runs.folders import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

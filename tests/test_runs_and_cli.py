@@ -20,25 +20,25 @@ import yaml
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-import train.compare
-import train.demo
-import train.evaluate
-import train.speed
-import train.summary
-from baselines.identification import Identification
-from elastic_env.config import load_yaml
-from elastic_env.errors import ConfigurationError, ResultsExistError
-from elastic_env.signals import Array
-from elastic_env.tasks.testbed import METRICS
+import train.evaluate.evaluate
+import train.experiments.compare
+import train.experiments.demo
+import train.report.summary
+import train.speed.speed
+from baselines.identification.identify import Identification
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError, ResultsExistError
+from elastic_env.core.signals import Array
+from elastic_env.robots.testbed.task import METRICS
 from tests.test_identification import synthetic
-from train.cli import main
-from train.compare import CompareConfig
-from train.conditions import Condition, PolicySpec
-from train.contenders import RawWorlds, ScalarLoop, VectorLoop
-from train.evaluate import Evaluation, evaluate
-from train.play import play
-from train.runs import new_run, run_folder
-from train.workers import show_progress
+from train.commands.cli import main
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.evaluate import Evaluation, evaluate
+from train.experiments.compare import CompareConfig
+from train.experiments.play import play
+from train.runs.folders import new_run, run_folder
+from train.runs.workers import show_progress
+from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
 MULTISINE = {"kind": "multisine", "amplitude": 0.05, "middle": 0.2, "duration_s": 0.2, "onset_s": 0.3}
@@ -79,8 +79,8 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.compare, "run_conditions", run)
-    monkeypatch.setattr(train.demo, "run_conditions", run)
+    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
+    monkeypatch.setattr(train.experiments.demo, "run_conditions", run)
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -111,7 +111,7 @@ def test_records_do_not_depend_on_how_episodes_are_batched(monkeypatch: pytest.M
     """Catches episodes lost or repeated where there are more of them than worlds."""
     cell = condition(reference=MULTISINE, episodes=5)
     whole = evaluate(cell, num_threads=1)
-    monkeypatch.setattr(train.evaluate, "_MAX_WORLDS", 2)
+    monkeypatch.setattr(train.evaluate.evaluate, "_MAX_WORLDS", 2)
     parts = evaluate(cell, num_threads=1)
     assert parts.episodes == whole.episodes
     np.testing.assert_array_equal(parts.trace["link_angle"], whole.trace["link_angle"])
@@ -318,13 +318,15 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
         for reason, value in (("", 0.001), ("diverged", 9.0), ("", 0.003), ("diverged", float("nan")))
     ]
     table = Console(width=160, record=True, file=StringIO())
-    table.print(train.summary.summary_table([Evaluation(condition(), episodes)]))
+    table.print(train.report.summary.summary_table([Evaluation(condition(), episodes)]))
     row = next(line for line in table.export_text().splitlines() if "input" in line)
     assert "2.00" in row
     assert "2/4" in row
-    assert train.summary.failure_notes([Evaluation(condition(), episodes)]) == []
+    assert train.report.summary.failure_notes([Evaluation(condition(), episodes)]) == []
     failed = Evaluation(condition(), [episode for episode in episodes if episode["termination"]])
-    assert train.summary.failure_notes([failed]) == ["input: diverged (2 of 2)"]  # the testbed keeps no time of it
+    assert train.report.summary.failure_notes([failed]) == [
+        "input: diverged (2 of 2)"
+    ]  # the testbed keeps no time of it
 
 
 @pytest.mark.usefixtures("in_process")
@@ -376,7 +378,11 @@ def test_output_that_holds_results_is_refused_before_the_work(
     Path("c.yaml").write_text(yaml.safe_dump({"name": "c", "references": [SINE]}))
     Path("taken").mkdir()
     Path("taken/notes.txt").write_text("keep me")
-    for name in ("train.compare.run_conditions", "train.identify.identify", "train.speed.measure"):
+    for name in (
+        "train.experiments.compare.run_conditions",
+        "train.experiments.identify.identify",
+        "train.speed.speed.measure",
+    ):
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail("the work began"))
     arguments = {"evaluate": ["--reference", COMMAND_SINE], "compare": ["c.yaml"]}.get(command, [])
     message = refused([command, *arguments, "--output", "taken"], capsys)
@@ -515,7 +521,7 @@ def test_wrong_argument_says_what_and_which_choices(
 ) -> None:
     """Catches tracebacks, units that vanish as markup, names that are not listed, and folders left behind."""
     arguments, words = COMMANDS[case]
-    monkeypatch.setattr("train.identify.identify", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr("train.experiments.identify.identify", lambda *_, **__: pytest.fail("the work began"))
     Path("good.yaml").write_text(yaml.safe_dump({"name": "c", "references": [SINE]}))
     message = refused(arguments, capsys)
     assert [word for word in words if word not in message] == []
@@ -571,7 +577,7 @@ def test_identify_writes_result_and_figure(monkeypatch: pytest.MonkeyPatch, caps
         masses.append(mass)
         return [synthetic(K=888.0, F=5.4, masses=(mass,))]
 
-    monkeypatch.setattr("baselines.identification.record_points", record)
+    monkeypatch.setattr("baselines.identification.identify.record_points", record)
     main(["identify", "--second-mass", "0.5", "--output", "result"])
     assert masses == [1.0, 0.5]
     result = Identification.load(Path("result/identification.json"))
@@ -660,7 +666,7 @@ def test_play_takes_one_step_at_least_and_the_episode_at_most(
     def film(env: Any, episode: Any, total: int, *_: Any) -> None:
         played.append((total, len(list(episode))))
 
-    monkeypatch.setattr("train.play._film", film)
+    monkeypatch.setattr("train.experiments.play._film", film)
     play(condition(), Console(quiet=True), Path("x.gif"), max_s=max_s)
     assert played == [(steps, steps)]
 
@@ -676,12 +682,16 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a demonstration that breaks on the way; with short references, so that it takes seconds."""
-    monkeypatch.setattr(train.demo, "_STATIC", train.demo._STATIC.replace(references=[HOLD]))
-    monkeypatch.setattr(train.demo, "_MOTION", train.demo._MOTION.replace(references=[SINE]))
+    monkeypatch.setattr(train.experiments.demo, "_STATIC", train.experiments.demo._STATIC.replace(references=[HOLD]))
+    monkeypatch.setattr(train.experiments.demo, "_MOTION", train.experiments.demo._MOTION.replace(references=[SINE]))
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
-    monkeypatch.setattr(train.demo, "_SLOW_WALK", train.demo._SLOW_WALK.replace(references=[short_walk]))
-    monkeypatch.setattr(train.demo, "_WALK", train.demo._WALK.replace(references=[short_walk]))
-    monkeypatch.setattr(train.demo, "_SOFT_WALK", train.demo._SOFT_WALK.replace(references=[short_walk]))
+    monkeypatch.setattr(
+        train.experiments.demo, "_SLOW_WALK", train.experiments.demo._SLOW_WALK.replace(references=[short_walk])
+    )
+    monkeypatch.setattr(train.experiments.demo, "_WALK", train.experiments.demo._WALK.replace(references=[short_walk]))
+    monkeypatch.setattr(
+        train.experiments.demo, "_SOFT_WALK", train.experiments.demo._SOFT_WALK.replace(references=[short_walk])
+    )
     main(["demo"])
     printed = capsys.readouterr().out
     walks = {
@@ -720,7 +730,7 @@ import sys, time
 
 class Finder:
     def find_spec(self, name, path=None, target=None):
-        if name == "train.workers" and "--multiprocessing-fork" in sys.orig_argv:
+        if name == "train.runs.workers" and "--multiprocessing-fork" in sys.orig_argv:
             time.sleep({})
 
 sys.meta_path.insert(0, Finder())
@@ -740,7 +750,7 @@ def test_a_comparison_that_ends_takes_its_workers_with_it(
     policies = [{"name": name, "label": f"{name} {n}"} for n in range(3) for name in ("zero", "input")]
     (tmp_path / "long.yaml").write_text(yaml.safe_dump({"name": "long", "policies": policies}))
     process = subprocess.Popen(
-        [sys.executable, "-c", "from train.cli import main; main()", "compare", "long.yaml"],
+        [sys.executable, "-c", "from train.commands.cli import main; main()", "compare", "long.yaml"],
         cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
     )  # fmt: skip
@@ -786,4 +796,5 @@ def test_where_there_is_no_terminal_progress_is_a_line_now_and_then(monkeypatch:
         for now, number, done in [(1.0, 0, 50), (11.0, 0, 60), (12.0, 1, 60), (22.0, 1, 61), (40.0, 1, 100)]:
             clock.append(now)
             show(number, done)
-    assert console.file.getvalue().split() == ["30", "%", "60", "%", "80", "%"]  # type: ignore[attr-defined]
+    said = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert [line.strip() for line in said] == ["about 2 min to go", "30 %", "60 %", "80 %"]

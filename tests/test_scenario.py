@@ -8,8 +8,8 @@ import pytest
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.entry_points import make_walk_vector
-from elastic_env.scenario import Scenario, make_scenario
-from elastic_env.sensors import AttitudeSensor
+from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.runtime.sensors import AttitudeSensor
 
 
 @pytest.mark.parametrize("scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"])

@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from elastic_env.elasticity import ElasticJoint
-from elastic_env.errors import ElasticError
-from elastic_env.robots.joint_names import JointAddresses
-from elastic_env.robots.standing import Equilibrium, settle
-from elastic_env.robots.thormang import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
-from elastic_env.signals import Array
+from elastic_env.core.errors import ElasticError
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
+from elastic_env.robots.thormang.standing import Equilibrium, settle
 from tests.legs import foot_frames, holding_torque
 
 ROBOT = Thormang()

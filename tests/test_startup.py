@@ -9,13 +9,13 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.startup import Ramp
-from elastic_env.plan import quintic
-from elastic_env.robots.robot_model import WalkerModel
-from elastic_env.signals import Array
-from elastic_env.tasks.walk_config import WalkConfig
-from elastic_env.tasks.walk_in_place import WalkTask
-from elastic_env.walking.sway import sway_frequencies
+from baselines.compensation.startup import Ramp
+from elastic_env.core.signals import Array
+from elastic_env.motion.sway import sway_frequencies
+from elastic_env.motion.trajectory import quintic
+from elastic_env.robots.thormang.config import WalkConfig
+from elastic_env.robots.thormang.task import WalkTask
+from elastic_env.runtime.robot_model import WalkerModel
 from tests.trees import pendulum
 
 PERIOD_S = 0.004

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastic_env.rows import Rows
-from elastic_env.signals import Array
-from elastic_env.step_info import StepInfo
+from elastic_env.core.rows import Rows
+from elastic_env.core.signals import Array
+from elastic_env.runtime.step_info import StepInfo
 
 PLAIN = {"given": 1, "other": 2, "late": 3, "later": 4}
 

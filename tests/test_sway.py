@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from elastic_env.robots.joint_names import JointAddresses
-from elastic_env.robots.standing import settle
-from elastic_env.robots.thormang import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
-from elastic_env.signals import Array
-from elastic_env.walking.biped import Biped
-from elastic_env.walking.sway import sway_frequencies
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.biped import Biped
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.motion.sway import sway_frequencies
+from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
+from elastic_env.robots.thormang.standing import settle
 
 ROBOT = Thormang()
 BIPED = biped(ROBOT)

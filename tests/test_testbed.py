@@ -14,18 +14,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.elasticity import Servo
+from elastic_env.core.errors import ActionError, ConfigurationError
+from elastic_env.core.signals import Array
 from elastic_env.entry_points import make_testbed, make_testbed_vector
-from elastic_env.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.errors import ActionError, ConfigurationError
-from elastic_env.plan import STAND_S
-from elastic_env.references import Hold, Sine
-from elastic_env.robots.dynamixel import ENCODER_COUNTS_PER_TURN, H54_200_S500_R
-from elastic_env.robots.testbed import Pendulum
-from elastic_env.scenario import make_scenario, scenario_names
-from elastic_env.signals import Array
-from elastic_env.tasks import testbed
-from elastic_env.tasks.testbed_config import TestbedConfig
+from elastic_env.joint.dynamixel import ENCODER_COUNTS_PER_TURN, H54_200_S500_R
+from elastic_env.joint.elasticity import Servo
+from elastic_env.motion.references import Hold, Sine
+from elastic_env.motion.trajectory import STAND_S
+from elastic_env.robots.testbed import task as testbed
+from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.robots.testbed.model import Pendulum
+from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.runtime.scenario import make_scenario, scenario_names
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/Testbed-v0"
@@ -719,7 +719,7 @@ def test_a_wrong_argument_names_itself_and_what_exists(arguments: dict[str, Any]
     [
         ({"autoreset_mode": "Next"}, r"unknown autoreset mode 'Next'; choose one of: NextStep, SameStep, Disabled"),
         ({"num_envs": 0}, r"num_envs must be a whole number >= 1, got 0"),
-        ({"render_mode": "human"}, r"does not render, got render_mode 'human'; use None"),
+        ({"render_mode": "human"}, r"unknown render mode of a vector environment 'human'; choose one of: rgb_array"),
     ],
 )
 def test_a_wrong_argument_of_the_vector_environment_names_itself(arguments: dict[str, Any], message: str) -> None:

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from elastic_env.rigid_body import RigidBody
-from elastic_env.robots.elastic_joint import make_elastic
-from elastic_env.robots.thormang import ANKLE_HEIGHT_M, LEG, LEG_JOINTS, Thormang, rigid_spec
-from elastic_env.walking.leg_kinematics import foot_pose, leg_angles
+from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles
+from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.joint.make_elastic import make_elastic
+from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS, Thormang, rigid_spec
 
 
 def held(robot: Thormang | None = None) -> mujoco.MjModel:

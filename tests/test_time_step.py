@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.elasticity import ElasticJoint, Servo
-from elastic_env.errors import ConfigurationError
-from elastic_env.robots.elastic_joint import make_elastic
-from elastic_env.robots.time_step import largest_stable_timestep, spectral_radius
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.make_elastic import make_elastic
+from elastic_env.joint.time_step import largest_stable_timestep, spectral_radius
 
 SPRING = """<mujoco><option timestep="0.01" integrator="{integrator}" gravity="0 0 0"/><worldbody><body>
   <joint type="slide" axis="1 0 0" stiffness="{stiffness}"/><geom size=".1" mass="4"/></body></worldbody></mujoco>"""
@@ -86,7 +86,7 @@ FULL = """<mujoco><size memory="20K"/><worldbody><geom type="plane" size="1 1 1"
 
 def test_a_full_arena_is_said_once_and_is_no_divergence() -> None:
     """Catches an episode that ends as diverged although its state is finite."""
-    from elastic_env.simulation import SingleWorld
+    from elastic_env.runtime.physics import SingleWorld
 
     bodies = "".join(f'<body pos="{0.05 * i} 0 .02"><freejoint/><geom size=".03"/></body>' for i in range(12))
     simulation = SingleWorld(mujoco.MjModel.from_xml_string(FULL.format(bodies=bodies)))

@@ -20,21 +20,21 @@ from gymnasium.vector import AutoresetMode
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import baselines
-from baselines.residual import load_residual
+from baselines.residual.residual import load_residual
 from baselines.residual_env import ResidualVectorWrapper
-from elastic_env.errors import ConfigurationError, ElasticError
-from elastic_env.signals import Array
-from train.bench import BenchCase
-from train.cli import main
-from train.constant_search import ConstantSearch
-from train.evaluate import evaluate, make_vector_env
-from train.learn import Training
-from train.mixed_env import MixedVectorEnv, threads_of_each
-from train.progress import read_progress
-from train.sb3_env import SB3VecEnv
-from train.scores import played_together
-from train.state import capture, read_state, restore, write_state
-from train.train_config import TrainConfig, training_worlds
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
+from train.commands.cli import main
+from train.evaluate.evaluate import evaluate, make_vector_env
+from train.evaluate.progress import read_progress
+from train.experiments.bench import BenchCase
+from train.learn.constant_search import ConstantSearch
+from train.learn.mixed_env import MixedVectorEnv, threads_of_each
+from train.learn.sb3_env import SB3VecEnv
+from train.learn.scores import played_together
+from train.learn.state import capture, read_state, restore, write_state
+from train.learn.train_config import TrainConfig, training_worlds
+from train.learn.training import Training
 
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
@@ -126,7 +126,7 @@ def test_a_killed_training_goes_on(tmp_path: Path) -> None:
     """Catches a checkpoint that is half written, and a kill that loses or repeats an evaluation."""
     code = (
         "from pathlib import Path; import sys; from tests.test_training import SMALL, PPO;"
-        "from train.learn import Training; from train.train_config import TrainConfig;"
+        "from train.learn.training import Training; from train.learn.train_config import TrainConfig;"
         "Training(TrainConfig(**{**SMALL, **PPO}), 1, Path(sys.argv[1])).run()"
     )
     killed, whole = tmp_path / "killed", tmp_path / "whole"
@@ -342,7 +342,7 @@ def test_worlds_that_one_policy_cannot_play_are_no_mixture() -> None:
     for pair in ([one, some_worlds(n=1, stiffness=900.0)], [some_worlds("walker", 1, x) for x in ("ideal", "soft")]):
         with pytest.raises(ConfigurationError, match=r"assume the same joints: .* apart from the others"):
             MixedVectorEnv(pair)
-    with pytest.raises(ConfigurationError, match=r"oracle .* one environment"):
+    with pytest.raises(ConfigurationError, match=r"oracle .* which MixedVectorEnv does not have"):
         baselines.make("oracle", MixedVectorEnv([one]))
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from elastic_env.errors import ConfigurationError
-from train.user_code import named_object
+from elastic_env.core.errors import ConfigurationError
+from train.runs.user_code import named_object
 
 TRAIN = """
 import gymnasium

@@ -16,15 +16,16 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.spatial.transform import Rotation
 
 import elastic_env  # noqa: F401  registers the environments
+from elastic_env.core.errors import ActionError, ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.walk_kernels import tilt_penalty, zmp_penalty
 from elastic_env.entry_points import make_walk, make_walk_vector
-from elastic_env.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.errors import ActionError, ConfigurationError
-from elastic_env.robots.joint_names import spring_name
-from elastic_env.scenario import make_scenario
-from elastic_env.signals import Array
-from elastic_env.tasks import walk_config, walk_in_place
-from elastic_env.tasks.walk_config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
-from elastic_env.walking.kernels import tilt_penalty, zmp_penalty
+from elastic_env.joint.joint_names import spring_name
+from elastic_env.robots.thormang import config as walk_config
+from elastic_env.robots.thormang import task as walk_in_place
+from elastic_env.robots.thormang.config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
+from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.runtime.scenario import make_scenario
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/WalkInPlace-v0"

@@ -14,25 +14,25 @@ from gymnasium.vector import AutoresetMode
 from PIL import Image
 from rich.console import Console
 
-import train.compare
+import train.experiments.compare
 from baselines.residual_env import ResidualVectorWrapper
-from baselines.walking_controller import LocalFrame, local_frame
-from elastic_env.config import load_yaml
-from elastic_env.robots.robot_model import WalkerModel
-from elastic_env.signals import Array
-from elastic_env.walking.gait import LEFT, RIGHT
-from elastic_env.walking.leg_kinematics import rotation_x, rotation_y
-from train.cli import main
-from train.compare import CompareConfig, try_out
-from train.conditions import Condition, PolicySpec
-from train.contenders import RawWorlds, VectorLoop
-from train.evaluate import Evaluation, evaluate, make_vector_env
-from train.figures import figure_name, option_curves, reference_curves
-from train.summary import failure_notes, print_summary, summary_table, write_summary
-from train.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
-from train.sweep_plots import draw_sweep
-from train.train_config import TrainConfig
-from train.walk_plots import draw_pelvis, draw_zmp, intervals
+from baselines.walking.controller import LocalFrame, local_frame
+from elastic_env.core.config import load_yaml
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_kinematics import rotation_x, rotation_y
+from elastic_env.motion.gait import LEFT, RIGHT
+from elastic_env.runtime.robot_model import WalkerModel
+from train.commands.cli import main
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.evaluate import Evaluation, evaluate, make_vector_env
+from train.evaluate.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
+from train.experiments.compare import CompareConfig, try_out
+from train.figures.figures import figure_name, option_curves, reference_curves
+from train.figures.sweep_plots import draw_sweep
+from train.figures.walk_plots import draw_pelvis, draw_zmp, intervals
+from train.learn.train_config import TrainConfig
+from train.report.summary import failure_notes, print_summary, summary_table, write_summary
+from train.speed.contenders import RawWorlds, VectorLoop
 
 SHORT = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
 TWO_STEPS = {"step_period": [0.3, 0.5, 0.3], "num_steps": 2}
@@ -71,7 +71,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.compare, "run_conditions", run)
+    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
 
 
 @pytest.fixture(scope="module")
@@ -412,13 +412,13 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     """Catches files that are lost or not named, and figures with policies that they should not show."""
     drawn: list[list[str]] = []
     for name in ("pelvis", "zmp"):
-        draw = train.figures._FIGURES[name]
+        draw = train.figures.figures._FIGURES[name]
 
         def record(evaluations: Sequence[Evaluation], path: Path, draw: Any = draw) -> Path:
             drawn.append([e.condition.policy.title for e in evaluations])
             return draw(evaluations, path)
 
-        monkeypatch.setitem(train.figures._FIGURES, name, record)
+        monkeypatch.setitem(train.figures.figures._FIGURES, name, record)
     content = {
         "name": "walks", "env": "walker", "references": [SHORT], "scenarios": ["ideal"],
         "policies": ["zero", "input", {"name": "zero", "label": "rigid", "env_options": {"form": "rigid"}}],

@@ -10,13 +10,13 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensators import DynamicCompensator, GravityCompensator
-from baselines.gravity_torque import make_gravity
-from baselines.oracle import Oracle
-from baselines.policy import Zero
-from baselines.walking_controller import WalkingController, WalkingGains
-from elastic_env.errors import ConfigurationError
-from elastic_env.signals import Array
+from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
+from baselines.compensation.gravity_torque import make_gravity
+from baselines.compensation.oracle import Oracle
+from baselines.compensation.policy import Zero
+from baselines.walking.controller import WalkingController, WalkingGains
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
 
 ID = "elastic_env/WalkInPlace-v0"
 NAMES = (

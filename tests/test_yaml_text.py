@@ -5,7 +5,7 @@ import time
 import pytest
 import yaml
 
-from elastic_env.yaml_text import DEEPEST_NESTING, parse_yaml
+from elastic_env.core.yaml_text import DEEPEST_NESTING, parse_yaml
 
 LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 9)

@@ -1,6 +1,6 @@
 """What can go wrong with hardware; every message names the port and says what to do."""
 
-from elastic_env.errors import SystemFailedError
+from elastic_env.core.errors import SystemFailedError
 
 
 class HardwareError(SystemFailedError):

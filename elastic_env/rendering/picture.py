@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from elastic_env.errors import ElasticError
-from elastic_env.headless import CURE
-from elastic_env.signals import Signals
+from elastic_env.core.errors import ElasticError
+from elastic_env.core.signals import Signals
+from elastic_env.rendering.headless import CURE
 
 Image: TypeAlias = npt.NDArray[np.uint8]
 Rgba: TypeAlias = tuple[float, float, float, float]

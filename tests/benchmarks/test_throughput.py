@@ -6,7 +6,7 @@ Compare within a group of one run only. `elastic speed` interleaves the same con
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from train.contenders import RawWorlds, ScalarLoop, VectorLoop
+from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 STEPS = 20
 CASES = [

@@ -27,7 +27,7 @@ class Bench:
 
     def run(self) -> None:
         """Play and compare."""
-        from train.bench import bench, configuration
+        from train.experiments.bench import bench, configuration
 
         if not bench(configuration(self.config, self.update), CONSOLE, self.update, self.output):
             sys.exit(1)
@@ -68,7 +68,7 @@ class Speed:
 
     def run(self) -> None:
         """Measure and report."""
-        from train.speed import SpeedConfig, measure_all
+        from train.speed.speed import SpeedConfig, measure_all
 
         with options_named():
             given = {name: value for name, value in vars(self).items() if name not in ("output", "profile")}

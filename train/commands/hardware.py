@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from elastic_env.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError
 from train.commands.options import CONSOLE, OnHardware, motion
 
 
@@ -25,7 +25,7 @@ class Scan:
 
     def run(self) -> None:
         """Scan."""
-        from train.hardware import scan
+        from train.hardware.session import scan
 
         if not scan(self.port, self.baudrate, CONSOLE):
             sys.exit(3)
@@ -51,7 +51,7 @@ class Check:
 
     def run(self) -> None:
         """Check."""
-        from train.hardware import check
+        from train.hardware.session import check
 
         if not check(self.port, self.ids, self.baudrate, self.imu_port, self.imu_baudrate, CONSOLE):
             sys.exit(3)
@@ -75,8 +75,8 @@ class Run:
 
     def run(self) -> None:
         """Play."""
-        from train.conditions import PolicySpec
-        from train.hardware import run
+        from train.evaluate.conditions import PolicySpec
+        from train.hardware.session import run
 
         if not (arguments := self.on.arguments):
             raise ConfigurationError("--port is needed; see: elastic hardware scan PORT, elastic hardware emulate")
@@ -126,7 +126,7 @@ class Emulate:
         from elastic_env.entry_points import configure_testbed
         from elastic_env.hardware.emulator.config import EmulatorConfig
         from elastic_env.hardware.emulator.faults import Faults
-        from train.hardware import emulate, require_switches
+        from train.hardware.session import emulate, require_switches
 
         require_switches(self.fault)
         faults = Faults(
@@ -156,7 +156,7 @@ class Prove:
 
     def run(self) -> None:
         """Measure."""
-        from train.prove_hardware import prove
+        from train.hardware.prove import prove
 
         if not prove(self.share, self.only, CONSOLE, self.output):
             sys.exit(3)

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from elastic_env.config import load_yaml
-from elastic_env.errors import ConfigurationError
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError
 from train.commands.options import CONSOLE, options_named
 
 
@@ -45,9 +45,9 @@ class Train:
             raise ConfigurationError(
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
-        from train.run_training import resume, start
-        from train.train_config import TrainConfig
-        from train.workers import require_jobs
+        from train.learn.run_training import resume, start
+        from train.learn.train_config import TrainConfig
+        from train.runs.workers import require_jobs
 
         require_jobs(self.jobs)
         if self.resume is not None:
@@ -80,9 +80,9 @@ class Export:
 
     def run(self) -> None:
         """Export."""
-        from train.export import export_zip
-        from train.runs import own_folder
-        from train.train_config import TrainConfig
+        from train.learn.export import export_zip
+        from train.learn.train_config import TrainConfig
+        from train.runs.folders import own_folder
 
         config = load_yaml(self.config, TrainConfig)
         with own_folder(self.model.stem, self.output) as folder:

@@ -9,9 +9,9 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from elastic_env.config_problems import ModelError, ParameterPath
-from elastic_env.errors import ConfigurationError
-from elastic_env.yaml_text import parse_yaml
+from elastic_env.core.config_problems import ModelError, ParameterPath
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.yaml_text import parse_yaml
 
 CONSOLE = Console(emoji=False)  # a policy of the user may be called mine:zero
 """Where the commands say what they do."""
@@ -41,7 +41,7 @@ class OnHardware:
         """Arguments of the environment on hardware; empty for the simulation."""
         if self == OnHardware():
             return {}
-        from train.hardware import hardware_arguments
+        from train.hardware.session import hardware_arguments
 
         return hardware_arguments(self.port, self.imu_port, self.mounting, yes=self.yes, patient=self.patient)
 
@@ -88,7 +88,7 @@ def _option(path: ParameterPath) -> str:
 
 def motion(env: str, text: str | None) -> Any:
     """A reference as it is written: a name, a number, durations or a mapping; the environment's default for None."""
-    from train.environments import environment
+    from train.evaluate.environments import environment
 
     default = environment(env).default_reference
     if text is None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from elastic_env.config import load_yaml
+from elastic_env.core.config import load_yaml
 from train.commands.options import (
     CONSOLE,
     DEFAULT_SCENARIO,
@@ -48,7 +48,7 @@ class Identify:
 
     def run(self) -> None:
         """Identify, write, print."""
-        from train.identify import IdentifyConfig, run_identification
+        from train.experiments.identify import IdentifyConfig, run_identification
 
         arguments = self.on.arguments
         with options_named():
@@ -94,8 +94,8 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate as a comparison of one cell."""
-        from train.compare import CompareConfig, compare
-        from train.conditions import PolicySpec
+        from train.evaluate.conditions import PolicySpec
+        from train.experiments.compare import CompareConfig, compare
 
         options = {} if self.stiffness is None else {"stiffness": stiffness_option(self.stiffness)}
         arguments = self.on.arguments
@@ -138,7 +138,7 @@ class Compare:
 
     def run(self) -> None:
         """Compare."""
-        from train.compare import CompareConfig, compare
+        from train.experiments.compare import CompareConfig, compare
 
         config, arguments = load_yaml(self.config, CompareConfig), self.on.arguments
         if arguments:
@@ -176,8 +176,8 @@ class Play:
 
     def run(self) -> None:
         """Play."""
-        from train.conditions import Condition, PolicySpec
-        from train.play import play
+        from train.evaluate.conditions import Condition, PolicySpec
+        from train.experiments.play import play
 
         reference = "sine" if self.reference is None and self.env == "testbed" else self.reference
         with options_named():
@@ -197,7 +197,7 @@ class Demo:
 
     def run(self) -> None:
         """Run the demonstration."""
-        from train.demo import demo
+        from train.experiments.demo import demo
 
         demo(CONSOLE, self.output)
 

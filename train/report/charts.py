@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from train.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
-from train.environments import Column
-from train.escaping import chart_text
-from train.evaluate import Evaluation
+from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
+from train.evaluate.environments import Column
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.statistics import Estimate
 from train.report.parts import (
     INK,
     LONGEST_NAME,
@@ -27,7 +27,7 @@ from train.report.parts import (
     round_numbers,
     shortened,
 )
-from train.statistics import Estimate
+from train.runs.escaping import chart_text
 
 
 def ladder(lines: Lines, reference: str) -> Chart:

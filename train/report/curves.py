@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from train.changes import level
-from train.environments import Column, Signal
-from train.escaping import chart_text
-from train.evaluate import Evaluation
-from train.plots import line_style
-from train.progress import Curves
+from train.evaluate.changes import level
+from train.evaluate.environments import Column, Signal
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.progress import Curves
+from train.figures.plots import line_style
+from train.figures.walk_plots import intervals
 from train.report.parts import (
     GRID,
     INK,
@@ -29,7 +29,7 @@ from train.report.parts import (
     shortened,
     thinned,
 )
-from train.walk_plots import intervals
+from train.runs.escaping import chart_text
 
 _SHADE = "#f1f3f5"
 _POINTS, _LEAST_POINTS, _ALL_POINTS = 600, 250, 6000

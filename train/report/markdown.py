@@ -4,10 +4,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from train.changes import Change, by_line, percent_interval
-from train.changes_tables import falls
-from train.escaping import markdown_table, markdown_text
+from train.evaluate.changes import Change, by_line, percent_interval
+from train.report.changes_tables import falls
 from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
+from train.runs.escaping import markdown_table, markdown_text
 
 
 def markdown(results: Results) -> str:

@@ -5,10 +5,10 @@ from html import escape
 
 import numpy as np
 
-from train.changes import CEILING, Change, by_line, percent_interval
-from train.changes_tables import falls
-from train.escaping import script_json
+from train.evaluate.changes import CEILING, Change, by_line, percent_interval
+from train.report.changes_tables import falls
 from train.report.parts import FONT, VERDICTS, Chart
+from train.runs.escaping import script_json
 
 _STYLE = """
 :root { --ink: #1f2328; --soft: #59636e; --line: #d0d7de; --faint: #f6f8fa; --link: #0b5cad; }

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.signals import Array
-from train.environments import Column, Environment, Signal
-from train.evaluate import Evaluation
-from train.plots import colours
-from train.statistics import Estimate
+from elastic_env.core.signals import Array
+from train.evaluate.environments import Column, Environment, Signal
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.statistics import Estimate
+from train.figures.plots import colours
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
 INK, GRID, FRAME = "#1f2328", "#e8eaed", "#8b949e"

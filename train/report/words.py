@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from train.changes import (
+from train.evaluate.changes import (
     CEILING,
     FEWEST_SEEDS,
     HELD_OUT,
@@ -18,10 +18,10 @@ from train.changes import (
     level,
     percent_interval,
 )
-from train.environments import Column
-from train.evaluate import Evaluation
-from train.families import Origin
-from train.progress import Curves, learning_curves
+from train.evaluate.environments import Column
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.families import Origin
+from train.evaluate.progress import Curves, learning_curves
 from train.report.parts import Lines, number_interval
 
 SCORES = (

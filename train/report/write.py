@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from elastic_env.errors import missing_extra
-from train.evaluate import Evaluation
-from train.figures import has_swept_references
+from elastic_env.core.errors import missing_extra
+from train.evaluate.evaluate import Evaluation
+from train.figures.figures import has_swept_references
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
 from train.report.markdown import markdown

@@ -5,11 +5,11 @@ from typing import Self
 
 from pydantic import model_validator
 
-from elastic_env.config import Model, quantity
-from elastic_env.hardware.control_table import servo_model
+from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.protocol import RATES, require_ids
-from elastic_env.tasks.testbed_config import TestbedConfig
+from elastic_env.hardware.servo_bus.control_table import servo_model
+from elastic_env.hardware.servo_bus.protocol import RATES, require_ids
+from elastic_env.robots.testbed.config import TestbedConfig
 
 
 class EmulatorConfig(Model):

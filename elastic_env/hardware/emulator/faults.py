@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.config import Model, quantity
+from elastic_env.core.config import Model, quantity
 
 Angles = tuple[float, float, float]
 

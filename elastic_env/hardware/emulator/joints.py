@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastic_env.errors import ConfigurationError
-from elastic_env.robots.joint_names import JointAddresses
-from elastic_env.robots.testbed import JOINT, elastic_spec
-from elastic_env.signals import Array
-from elastic_env.simulation import simulate
-from elastic_env.tasks.testbed_config import TestbedConfig
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.robots.testbed.model import JOINT, elastic_spec
+from elastic_env.runtime.physics import simulate
 
 _LARGEST_LAG_S = 0.25
 

@@ -19,16 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware import protocol
-from elastic_env.hardware.control_table import servo_model
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Angles, changed, damage, distort, flip_bit
 from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.mip import attitude_packet
 from elastic_env.hardware.emulator.servo import EmulatedServo
 from elastic_env.hardware.emulator.wire import EmulatedBus
-from elastic_env.hardware.realtime import Priority, prefer_realtime
-from elastic_env.sensors import attitude
+from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
+from elastic_env.hardware.servo_bus import protocol
+from elastic_env.hardware.servo_bus.control_table import servo_model
+from elastic_env.runtime.sensors import attitude
 
 _PHYSICS_S, _LONGEST_PHYSICS_S = 2e-3, 5e-3  # between two advances: as a rule, and while replies go out
 _PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at once, or what it has after that time

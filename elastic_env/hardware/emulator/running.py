@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware.child_process import child_command, child_environment
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.safety.child_process import child_command, child_environment
 
 _LONGEST_SWING_S, _REST_RAD_S = 10.0, 0.02
 _LOOK_S, _STILL_LOOKS = 0.05, 3  # where a swing turns back it stands still for one look

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from elastic_env.hardware import protocol
-from elastic_env.hardware.control_table import Register, ServoModel
-from elastic_env.hardware.torque_line import LARGEST_TORQUE_NM, current_of_torque
+from elastic_env.hardware.servo_bus import protocol
+from elastic_env.hardware.servo_bus.control_table import Register, ServoModel
+from elastic_env.hardware.servo_bus.torque_line import LARGEST_TORQUE_NM, current_of_torque
 
 OVERLOAD = 1 << 5
 """Bit of an overload in the hardware error status."""

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from elastic_env.hardware import protocol
 from elastic_env.hardware.emulator.servo import EmulatedServo
-from elastic_env.hardware.protocol import Packet
+from elastic_env.hardware.servo_bus import protocol
+from elastic_env.hardware.servo_bus.protocol import Packet
 
 
 class EmulatedBus:

@@ -1,0 +1,108 @@
+"""Joint elasticity compensated around any policy (Fig. 2 of the paper)."""
+
+from typing import Any
+
+import numpy as np
+
+from baselines.compensation.compensators import Compensator
+from baselines.compensation.policy import Action, ObservationView, Policy, resume
+from baselines.compensation.startup import Ramp
+from elastic_env.core.signals import Array
+from elastic_env.motion.trajectory import STAND_S
+
+
+class Compensated:
+    """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
+
+    The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees the estimated link
+    angle and rate where the observation has the encoder's; the compensator's offset for q_d is added to its action.
+    The compensation grows from zero in the first `ramp_s` of an episode, while the reference stands.
+
+    Args:
+        policy: Anything with `predict`; its state may be anything. One that does not read joint rates can say so by an
+            attribute `reads_rates = False`, which saves their estimate.
+        compensator: Where the motor has to lead, and where the link is.
+        ramp_s: Duration of the ramp.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        compensator: Compensator,
+        ramp_s: float = STAND_S,
+    ) -> None:
+        self.policy, self.compensator = policy, compensator
+        model = compensator.model
+        self._num_joints = len(model.joint_names)
+        self._shows_rates = getattr(policy, "reads_rates", True)
+        self._view = ObservationView(model.observation_table, model.control_period_s)
+        self._ramp = Ramp(model, ramp_s)
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Compensated action and new state.
+
+        Raises:
+            ElasticError: Called in the middle of an episode without the state of the last call.
+        """
+        return self.predict_corrected(observation, None, state, episode_start, deterministic)
+
+    def predict_corrected(
+        self,
+        observation: Array,
+        correction: Array | None,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Action, Any]:
+        """`predict` with another model of the joints: the deflection that is compensated, and seen, is (1 + r) δ.
+
+        Args:
+            observation: As in `predict`.
+            correction: Relative change r of the deflection, (num_worlds, n) [1]; None for none. Zeros are the same to
+                the last bit.
+            state: As in `predict`.
+            episode_start: As in `predict`.
+            deterministic: As in `predict`.
+        """
+        rows, n = self._view.rows(observation), self._num_joints
+        desired, compensator = self._view.motion(rows), self.compensator.at(rows)
+        memory, inner_state = resume(
+            state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1 + n, 0)))
+        )
+        own = memory[:, 1 + n :]
+        links = self._links(compensator, rows, own, correction)
+        seen = self._seen(compensator, rows, links)
+        action, inner_state = self.policy.predict(
+            seen if observation.ndim > 1 else seen[0], inner_state, episode_start, deterministic
+        )
+        action = np.atleast_2d(np.asarray(action, dtype=np.float64))
+        offset, kept = compensator.offset(desired.shifted(action), own)
+        if correction is not None:
+            offset = offset + correction * compensator.deflection(offset, kept)
+        steps = memory[:, :1] + 1.0
+        total = (action + self._ramp.share(steps) * offset).astype(np.float32)
+        return total.reshape((*observation.shape[:-1], n)), (np.hstack([steps, links, kept]), inner_state)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angle that the policy saw in the place of an observation's encoders, (..., n) [rad].
+
+        Args:
+            observation: As in `predict`.
+            state: What `predict` returned for it.
+        """
+        memory, _ = state
+        return memory[:, 1 : 1 + self._num_joints].reshape((*observation.shape[:-1], self._num_joints))
+
+    def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
+        """The links' angles by the encoders."""
+        theta = self._view.theta(rows)
+        q = compensator.link_angle(theta, memory)
+        return q if correction is None else q - correction * (theta - q)
+
+    def _seen(self, compensator: Compensator, rows: Array, links: Array) -> Array:
+        """The observations with the links' angles and rates where they have the encoders'."""
+        theta_dot = self._view.theta_dot(rows)
+        rate = compensator.link_rate(self._view.theta(rows), theta_dot) if self._shows_rates else theta_dot
+        return self._view.with_links(rows, links, rate)

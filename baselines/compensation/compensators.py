@@ -1,0 +1,288 @@
+r"""Compensators of joint elasticity: input (Eq. 9), output (Eqs. 10 to 12), and from the full joint torque.
+
+An input compensator says by how much the motor side has to lead so that the link is where it should be; an output
+compensator says where the link is when the motor encoder shows θ. All work on (..., n) arrays.
+
+[Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
+"""
+
+import copy
+from dataclasses import dataclass
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+
+from baselines.compensation.contact_torque import LegTorque
+from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
+from elastic_env.core.errors import unknown_name
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
+from elastic_env.runtime.robot_model import RobotModel
+
+OutputMethod = Literal["taylor", "newton", "wrench", "none"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Desired motion of the links, (..., n) each [rad], [rad/s], [rad/s²]."""
+
+    q: Array
+    q_dot: Array
+    q_ddot: Array
+
+    def shifted(self, offset: Array) -> "Motion":
+        """The motion with its angles moved by an offset [rad]."""
+        return Motion(self.q + offset, self.q_dot, self.q_ddot)
+
+
+def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel) -> Array:
+    r"""Eq. 9: θ_cmd − θ_d = K⁻¹ τ_g(θ_d), the offset that brings the link to θ_d.
+
+    Args:
+        q_desired: Link angle to reach, θ_d, (..., n) [rad].
+        stiffness: K, (n,) [N·m/rad].
+        gravity: τ_g of the assumed model.
+
+    Returns:
+        (..., n) [rad].
+    """
+    return static_deflection(gravity.gravity_torque(q_desired), stiffness)
+
+
+def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
+    r"""Eq. 12: link angle from the encoder with τ_g expanded to first order about θ (Eq. 11).
+
+    .. math:: q = \theta - (K + \partial\tau_g/\partial q|_\theta)^{-1} \tau_g(\theta)
+
+    Args:
+        theta: Encoder, θ, (..., n) [rad].
+        stiffness: K, (n,) [N·m/rad].
+        gravity: τ_g and its gradient.
+
+    Returns:
+        q, (..., n) [rad].
+
+    Raises:
+        ElasticError: The matrix is singular.
+    """
+    return theta - _solve(gravity, theta, stiffness, gravity.gravity_torque(theta))
+
+
+def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
+    """Eq. 10 solved by Newton-Raphson from q = θ; arguments and errors as `taylor_link_angle`, residual below 1e-12."""
+    return static_link_angle(theta, stiffness, gravity.gravity_torque, gravity.gravity_gradient)
+
+
+class Compensator(Protocol):
+    """What `baselines.Compensated` needs: an input offset for a motion, and a link angle for an encoder angle.
+
+    `memory` has one row per world and `memory_width` columns; a compensator without memory has none.
+    """
+
+    model: RobotModel
+    memory_width: int
+
+    def at(self, rows: Array) -> "Compensator":
+        """The compensator for the loads at the control steps of observations, (num_worlds, m)."""
+        ...
+
+    def begin(self, motion: Motion) -> Array:
+        """Memory at rest at the start of an episode, (num_worlds, memory_width)."""
+        ...
+
+    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
+        """Command offset for the coming control period, (num_worlds, n) [rad], and the new memory."""
+        ...
+
+    def deflection(self, offset: Array, memory: Array) -> Array:
+        """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n) [rad]."""
+        ...
+
+    def link_angle(self, theta: Array, memory: Array) -> Array:
+        """Estimate of q from the encoders, (num_worlds, n) [rad]."""
+        ...
+
+    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
+        """Estimate of q̇ from the encoders, (num_worlds, n) [rad/s]."""
+        ...
+
+
+class GravityCompensator:
+    """The paper's compensator: Eq. 9 on the input, Eq. 12 (or Newton on Eq. 10) on the output.
+
+    Args:
+        model: Assumed robot.
+        output: "taylor" for Eq. 12, "newton" for Eq. 10, "wrench" for Eq. 12 with the torque of the measured foot
+            wrenches (walker), "none" to leave the encoder as it is.
+        method: How the gravity torque is computed; None for the robot's default.
+
+    Raises:
+        ConfigurationError: Unknown output method or gravity method, or one that the robot does not have.
+    """
+
+    memory_width = 0
+
+    def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
+        if output not in get_args(OutputMethod):
+            raise unknown_name("output compensator", output, get_args(OutputMethod))
+        self.model = model
+        self.stiffness = model.stiffness
+        self.gravity = self._load = make_gravity(model, method)
+        """τ_g of the desired posture and of the measured one."""
+        self._source, self._load_source = self.gravity, make_load(model, output, self.gravity)
+        self._output = output
+
+    def at(self, rows: Array) -> "GravityCompensator":
+        """See `Compensator`."""
+        bound = copy.copy(self)
+        bound.gravity = self._source.at(rows)
+        bound._load = self._load_source.at(rows, level=False)
+        return bound
+
+    def begin(self, motion: Motion) -> Array:
+        """See `Compensator`."""
+        return np.zeros((*motion.q.shape[:-1], 0))
+
+    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
+        """See `Compensator`."""
+        return input_offset(motion.q, self.stiffness, self.gravity), memory
+
+    def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
+        """See `Compensator`: all of the offset."""
+        return offset
+
+    def link_angle(self, theta: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
+        """See `Compensator`."""
+        if self._output == "none":
+            return theta
+        solve = newton_link_angle if self._output == "newton" else taylor_link_angle
+        return solve(theta, self.stiffness, self._load)
+
+    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
+        """See `Compensator`: the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇ at the estimated link angle."""
+        if self._output == "none":
+            return theta_dot
+        q = self.link_angle(theta, theta)
+        return _solve(self._load, q, self.stiffness, self.stiffness * theta_dot)
+
+
+class DynamicCompensator:
+    r"""Deflection from the full joint torque of the motion, and the inverse of the servo.
+
+    The link's inverse dynamics give τ_J; the transmission with its damping, K δ + D δ̇ = τ_J, gives δ; the rotor and the
+    servo, B θ̈ + τ_J = k_p e − k_v θ̇ + k_i ∫e, give the servo error e that the motion θ = q + δ needs. The command is
+    θ + e, taken at the middle of the control period over which it is held.
+
+    Memory per joint: δ, δ̇, ∫e, friction torque.
+
+    Args:
+        model: Assumed robot, with a servo on every joint.
+        output: Method for the rate estimate and for the start, as in `GravityCompensator`.
+        method: How the static torque is computed; None for the robot's default.
+        friction: Whether the model's Coulomb friction is part of the joint torque.
+    """
+
+    presliding_rad = 1e-3
+    """Displacement over which the friction turns round (Dahl's model) [rad]."""
+
+    def __init__(
+        self,
+        model: RobotModel,
+        output: OutputMethod = "taylor",
+        method: GravityMethod | None = None,
+        friction: bool = False,
+    ) -> None:
+        self.model = model
+        self._static = GravityCompensator(model, output, method)
+        self._body = self._source = make_dynamics(model, self._static.gravity)
+        self._measures = output == "wrench"
+        self._n, self._dt = len(model.joint_names), model.control_period_s
+        self._K, self._D, self._B = model.stiffness, model.damping, model.rotor_inertia
+        self._backlash, self._viscous = model.backlash, model.viscous_friction
+        self._coulomb = model.coulomb_friction if friction else np.zeros(self._n)
+        servos = model.servos
+        self._kp = np.array([servo.position_gain for servo in servos])
+        self._kv = np.array([servo.velocity_gain for servo in servos])
+        self._ki = np.array([servo.integral_gain for servo in servos])
+        self.memory_width = 4 * self._n
+
+    def at(self, rows: Array) -> "DynamicCompensator":
+        """See `Compensator`."""
+        bound = copy.copy(self)
+        bound._static, bound._body = self._static.at(rows), self._source.at(rows)
+        return bound
+
+    def with_stiffness(self, stiffness: Array) -> "DynamicCompensator":
+        """The compensator with another K, also one for every world, (..., n) [N·m/rad]."""
+        stiffer = copy.copy(self)
+        stiffer._K = stiffness
+        return stiffer
+
+    def begin(self, motion: Motion) -> Array:
+        """See `Compensator`."""
+        torque = self._static.gravity.gravity_torque(motion.q)
+        windup = np.divide(torque, self._ki, out=np.zeros_like(torque), where=self._ki > 0.0)
+        deflection = static_deflection(torque, self._K, self._backlash)
+        zero = np.zeros_like(torque)
+        return np.concatenate([deflection, zero, windup, zero], axis=-1)
+
+    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
+        """See `Compensator`."""
+        old_deflection, old_rate, old_windup, old_friction = np.split(memory, 4, axis=-1)
+        friction = self._friction(old_friction, motion.q_dot * self._dt)
+        torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
+        torque = torque + self._viscous * motion.q_dot + friction
+        settled = static_deflection(torque, self._K, self._backlash)
+        deflection = _first_order(old_deflection, settled, self._D / self._K, self._dt)
+        rate = (deflection - old_deflection) / self._dt
+        acceleration = (rate - old_rate) / self._dt
+        theta_dot, theta_ddot = motion.q_dot + rate, motion.q_ddot + acceleration
+        effort = self._B * theta_ddot + torque + self._kv * theta_dot
+        servo_error, windup = self._servo_error(effort, old_windup)
+        held_too_early = 0.5 * self._dt * theta_dot
+        offset = deflection + servo_error - held_too_early
+        return offset, np.concatenate([deflection, rate, windup, friction], axis=-1)
+
+    def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
+        """See `Compensator`: the offset less what the servo needs."""
+        return memory[..., : self._n]
+
+    def link_angle(self, theta: Array, memory: Array) -> Array:
+        """See `Compensator`: the deflection of the desired motion, or of the measured wrenches, off the encoder."""
+        if self._measures:
+            return self._static.link_angle(theta, memory)
+        return theta - memory[..., : self._n]
+
+    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
+        """See `Compensator`."""
+        return self._static.link_rate(theta, theta_dot)
+
+    def _friction(self, friction: Array, displacement: Array) -> Array:
+        """Coulomb friction with presliding: it turns round over a displacement, and stays at rest [Dahl1968]."""
+        full = self._coulomb * np.sign(displacement)
+        return full + (friction - full) * np.exp(-np.abs(displacement) / self.presliding_rad)
+
+    def _servo_error(self, effort: Array, windup: Array) -> tuple[Array, Array]:
+        """Error e [rad] with k_p e + k_i ∫e = effort [N·m], and ∫e [rad·s]."""
+        has_integrator = self._ki > 0.0
+        ki = np.where(has_integrator, self._ki, 1.0)
+        settled = _first_order(windup, effort / ki, self._kp / ki, self._dt)
+        error = np.where(has_integrator, effort - ki * settled, effort) / self._kp
+        return error, np.where(has_integrator, settled, 0.0)
+
+
+def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:
+    """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg where the legs do not couple, (..., n) [rad]."""
+    K = np.broadcast_to(stiffness, q.shape)
+    if not isinstance(gravity, LegTorque):
+        return solve_stiffness(K, gravity.gravity_gradient(q), torque)
+    blocks = gravity.gradient_by_leg(q)
+    by_leg = blocks.shape[:-1]
+    return solve_stiffness(K.reshape(by_leg), blocks, torque.reshape(by_leg)).reshape(q.shape)
+
+
+def _first_order(state: Array, target: Array, time_constant_s: Array, period_s: float) -> Array:
+    """State of a first-order lag after one period towards a constant target; no lag for a time constant of zero."""
+    with np.errstate(divide="ignore"):
+        decay = np.exp(-period_s / time_constant_s)
+    return target + decay * (state - target)

@@ -1,0 +1,53 @@
+r"""How a compensation grows from zero while the robot stands.
+
+The robot begins in static equilibrium without compensation; the compensated one stands elsewhere. A walker that is
+moved there within the second of standing would be left swinging on its springs, so its ramp is shaped [Singer1990]: two
+equal halves, half a period of its slowest sway apart, whose swings cancel.
+
+[Singer1990] N. C. Singer, W. P. Seering, "Preshaping Command Inputs to Reduce System Vibration", J. Dyn. Sys., Meas.,
+Control 112(1).
+"""
+
+import numpy as np
+
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.motion.sway import sway_frequencies
+from elastic_env.motion.trajectory import minimum_jerk
+from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+
+_SHORTEST_SHARE = 0.2
+
+
+class Ramp:
+    """Share of the compensation, growing from 0 to 1.
+
+    Args:
+        model: Assumed robot; a walker gets a shaped ramp where half a period of its sway fits.
+        duration_s: Duration of the ramp [s].
+    """
+
+    def __init__(self, model: RobotModel, duration_s: float) -> None:
+        self._duration = max(duration_s, model.control_period_s)
+        self._period_s = model.control_period_s
+        self._delay = 0.0
+        if isinstance(model, WalkerModel):
+            half_period = np.pi / sway_frequencies(model.biped, model.plan.pelvis[0], _held_stiffness(model))[0]
+            if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
+                self._delay = float(half_period)
+
+    def share(self, steps: Array) -> Array:
+        """Share after a number of control steps, elementwise."""
+        if self.is_over(steps).all():
+            return np.ones_like(steps)
+        time, each = steps * self._period_s, self._duration - self._delay
+        return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
+
+    def is_over(self, steps: Array) -> BoolArray:
+        """Whether the compensation is complete."""
+        return steps * self._period_s >= self._duration
+
+
+def _held_stiffness(model: RobotModel) -> Array:
+    """Springs in series with the servos that hold their motor side [N·m/rad]."""
+    servo = np.array([servo.position_gain for servo in model.servos])
+    return 1.0 / (1.0 / model.stiffness + 1.0 / servo)

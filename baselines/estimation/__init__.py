@@ -1,0 +1,1 @@
+"""What measurements say of the joints and of the ground."""

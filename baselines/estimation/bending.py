@@ -1,0 +1,128 @@
+r"""How much more a walker's joints bend than the model says, from what their motors and the IMU disagree on.
+
+A sole lies flat on the ground. By the motors' angles θ and the attitude of the IMU it seems to be tilted: by what the
+joints of its leg bend, δ = θ − q about their axes z, and by what never changes, the tilt of the ground and the errors
+of homing and of the mounting,
+
+.. math:: e = \sum_j z_j \delta_j + c
+
+The model and the measured foot wrenches say how much bending to expect, s = Σ z_j K⁻¹τ_j. With a common relative error
+ρ of that leg's model, e = (1 + ρ) s + c. Bending comes and goes with the load and c does not, so that recursive least
+squares over the time that a foot is loaded tell ρ from c, for roll and pitch of each leg [Kalman1960, without drift].
+
+[Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic Eng. 82.
+"""
+
+import numpy as np
+
+from baselines.compensation.compensators import GravityCompensator
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
+from elastic_env.runtime.robot_model import WalkerModel
+
+LOADED_SHARE = 0.15
+"""Share of the weight from which a foot counts as flat on the ground."""
+MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
+"""Standard deviations before the first measurement, of ρ and c, and of a measurement."""
+
+_UNKNOWNS = 2  # ρ and c
+_FILTERS = (2, 2)  # legs, roll and pitch
+_ESTIMATE, _VARIANCES = 8, 12  # per world: (legs, axes, unknowns) and (legs, axes, upper triangle)
+
+
+class BendingObserver:
+    """Estimates of the model's error, from the observations of a walker.
+
+    Memory per world: estimates of ρ and c, and their covariance.
+
+    Args:
+        model: Assumed walker.
+    """
+
+    names = (
+        *(f"model_error.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
+        *(f"uncertainty.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
+        "excess_load",
+    )
+    """What `observe` returns: ρ and its standard deviation, and measured over assumed load less one [1]."""
+    memory_width = _ESTIMATE + _VARIANCES
+
+    def __init__(self, model: WalkerModel) -> None:
+        self._model, self._compensator = model, GravityCompensator(model, output="wrench")
+        table = model.observation_table
+        self._theta, self._attitude = table.group("encoder_angle"), table.group("imu_attitude")
+        self._wrench = table.group("wrench")
+        self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
+
+    def begin(self, num_worlds: int) -> Array:
+        """Memory before the first measurement, (num_worlds, memory_width)."""
+        memory = np.zeros((num_worlds, self.memory_width))
+        prior = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
+        memory[:, -_VARIANCES:] = np.tile(prior, 4)
+        return memory
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """Estimates after a measurement, see `names`, and the new memory.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            memory: (num_worlds, memory_width).
+        """
+        n = len(rows)
+        force = rows[:, self._wrench].reshape(n, 2, 2, 3)[:, :, 0]
+        loaded: BoolArray = np.asarray(force[..., 2] >= LOADED_SHARE * self._carried)
+        estimate, variances = np.split(memory, [_ESTIMATE], axis=1)
+        seen, expected = self.disagreement(rows, self.bending(rows))
+        x, P = estimate.reshape(n, *_FILTERS, _UNKNOWNS), _symmetric(variances.reshape(n, *_FILTERS, 3))
+        x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
+        upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
+        excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0
+        deviation = np.sqrt(P[..., 0, 0].reshape(n, -1))
+        return np.hstack([x[..., 0].reshape(n, -1), deviation, excess]), np.hstack([x.reshape(n, -1), upper])
+
+    def bending(self, rows: Array) -> Array:
+        """Expected bending of the joints under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
+        theta = rows[:, self._theta]
+        return theta - self._compensator.at(rows).link_angle(theta, theta)
+
+    def expected_tilt(self, rows: Array) -> Array:
+        """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds, 2 legs, 2) [rad]."""
+        return self.disagreement(rows, self.bending(rows))[1]
+
+    def disagreement(self, rows: Array, bending: Array) -> tuple[Array, Array]:
+        """Tilt of the soles as motors and IMU see it, e, and the bending that is expected, s; of a foot that is flat.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            bending: Of the joints, (num_worlds, 12) [rad].
+
+        Returns:
+            (num_worlds, 2 legs, 2) each, roll and pitch [rad].
+        """
+        theta, attitude = rows[:, self._theta], rows[:, self._attitude]
+        bent = bending.reshape(len(rows), 2, -1).transpose(2, 0, 1)
+        chains = self._model.biped.chains
+        posture = chains.posture(theta.reshape(len(rows), 2, -1))
+        normal, turn = pair = np.zeros((2, 3, *bent.shape[1:]))
+        normal[2] = 1.0
+        vectors = pair.swapaxes(0, 1)
+        for j in range(len(chains.axis) - 1, -1, -1):
+            posture.into_parent(j, vectors, out=vectors)
+            turn[chains.axis[j]] += bent[j]
+        R = rotation_of_tilt(attitude).swapaxes(-1, -2)
+        up, expected = (np.moveaxis(vector, 0, -1) @ R for vector in pair)
+        return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
+
+
+def _symmetric(upper: Array) -> Array:
+    first, mixed, second = np.moveaxis(upper, -1, 0)
+    return np.stack([np.stack([first, mixed], axis=-1), np.stack([mixed, second], axis=-1)], axis=-2)
+
+
+def _least_squares(x: Array, P: Array, expected: Array, excess: Array, valid: BoolArray) -> tuple[Array, Array]:
+    """One step of recursive least squares for excess = ρ · expected + c, where it is valid."""
+    h = np.stack([expected, np.ones_like(expected)], axis=-1)
+    Ph = (P @ h[..., None])[..., 0]
+    gain = Ph / ((h * Ph).sum(axis=-1) + DISAGREEMENT_RAD**2)[..., None] * valid[..., None]
+    x = x + gain * (excess - (h * x).sum(axis=-1))[..., None]
+    return x, P - gain[..., :, None] * Ph[..., None, :]

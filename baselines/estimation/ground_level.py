@@ -1,0 +1,132 @@
+r"""What a walker's IMU and foot sensors would show if the ground were level.
+
+Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is left of its
+direction when the acceleration of the center of mass c is taken off is the tilt of the ground λ, whatever the joints
+bend:
+
+.. math:: \lambda = \overline{f_{xy} / f_z - \ddot c_{xy} / g}
+
+as rotations about x and y (λ_y, −λ_x). f is in the frame of the feet and c in that of the pelvis, which is parallel to
+them but for what the joints bend. The mean of the acceleration over a time t is a difference of velocities, known from
+the motors to some σ_v, so that with σ_λ before any measurement the best estimate is λ / (1 + (σ_v / g t σ_λ)²). The
+weight leans too, and acts at the center of mass, h over the ankles: set upright, it leaves the ankles with the wrenches
+of level ground,
+
+.. math:: f' = R f, \qquad m' = m + h \hat z \times (f' - f)
+
+A weight that leans bends the legs further than one that is upright, s and s' by the model
+(`baselines.estimation.bending`), each leg by its share w of the load. Level ground would not show that either, so that
+what the robot tilts by itself is
+
+.. math:: \text{attitude} - \lambda - \sum_{legs} w (s - s')
+
+On two feet that is too much about x, where a leaning weight goes from one foot to the other rather than to the ankles.
+"""
+
+import numpy as np
+
+from baselines.estimation.bending import BendingObserver
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
+from elastic_env.runtime.robot_model import WalkerModel
+
+LOADED_SHARE = 0.15
+"""Share of the weight from which the feet count as loaded."""
+
+TILT_RAD, VELOCITY_M_PER_S = 0.01, 0.07
+"""σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well velocities are known."""
+
+_DIFFERENCE_S = 1e-3
+
+
+class GroundLevel:
+    """Attitude and foot wrenches without the tilt of the ground, from the observations of a walker.
+
+    Memory per world: number of measurements in the mean, the mean, and the last velocity of the center of mass, nan
+    before the first.
+
+    Args:
+        model: Assumed walker.
+        period_s: Time between measurements [s].
+        mean_s: Time constant of the mean, after as much time [s].
+    """
+
+    names = (
+        "own_tilt.roll",
+        "own_tilt.pitch",
+        *(f"level_wrench.{side}_{part}{axis}" for side in "lr" for part in "fm" for axis in "xyz"),
+    )
+    """What `observe` returns: [rad], [N] and [N·m], the wrenches in the order of the observation."""
+    memory_width = 1 + 2 + 2
+
+    def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
+        table = model.observation_table
+        self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
+        self._theta, self._rate = table.group("encoder_angle"), table.group("encoder_rate")
+        self._carried, self._bending = model.biped.chains_above_feet, BendingObserver(model)
+        self._least_n = LOADED_SHARE * model.biped.weight
+        self._period_s, self._gravity = period_s, model.biped.gravity
+        self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
+
+    def begin(self, num_worlds: int) -> Array:
+        """Memory before the first measurement, (num_worlds, memory_width)."""
+        memory = np.zeros((num_worlds, self.memory_width))
+        memory[:, 3:] = np.nan
+        return memory
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """Values after a measurement, see `names`, and the new memory.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            memory: (num_worlds, memory_width).
+        """
+        lean, wrenches, memory = self.upright(rows, memory)
+        level = rows.copy()
+        level[:, self._attitude] -= lean
+        level[:, self._wrench] = wrenches
+        load = np.maximum(rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2], 0.0)
+        share = load / np.maximum(load.sum(axis=1, keepdims=True), self._least_n)
+        further = self._bending.expected_tilt(rows) - self._bending.expected_tilt(level)
+        own = level[:, self._attitude] - (share[..., None] * further).sum(axis=1)
+        return np.hstack([own, wrenches]), memory
+
+    def upright(self, rows: Array, memory: Array) -> tuple[Array, Array, Array]:
+        """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12), and the new memory."""
+        n = len(rows)
+        wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
+        force, moment = wrench[:, :, 0], wrench[:, :, 1]
+        over_ankles, velocity = self._center_of_mass(rows, force[..., 2])
+        mean, number = self._mean(force.sum(axis=1), velocity, memory)
+        lean = mean * self._certainty(number)[:, None]
+        R = rotation_of_tilt(lean)
+        upright = force @ R.swapaxes(-1, -2)
+        added = over_ankles * (upright - force)[..., :2]
+        turned = moment + np.stack([-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1)
+        wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
+        return lean, wrenches, np.column_stack([number, mean, velocity])
+
+    def _certainty(self, number: Array) -> Array:
+        """How much of the mean the estimate is, 0 to 1."""
+        change = self._gravity * TILT_RAD * self._period_s * number
+        return change**2 / (change**2 + VELOCITY_M_PER_S**2)
+
+    def _mean(self, force: Array, velocity: Array, memory: Array) -> tuple[Array, Array]:
+        """The mean after a measurement, about x and y [rad], and of how many it is."""
+        number, mean, before = memory[:, 0], memory[:, 1:3], memory[:, 3:]
+        is_known = (force[:, 2] >= self._least_n) & np.isfinite(before).all(axis=1)
+        accelerated = (velocity - before) / (self._period_s * self._gravity)
+        direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
+        seen = direction - np.where(is_known[:, None], accelerated, 0.0)
+        number = number + is_known
+        gain = is_known * np.maximum(1.0 / np.maximum(number, 1.0), self._least_gain)
+        return mean + gain[:, None] * (np.stack([seen[:, 1], -seen[:, 0]], axis=1) - mean), number
+
+    def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
+        """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded one, (n, 2)."""
+        n = len(rows)
+        theta, rate = (rows[:, group].reshape(n, 2, -1) for group in (self._theta, self._rate))
+        com, ankles = self._carried.com_and_feet(np.stack([theta, theta + _DIFFERENCE_S * rate]))
+        now, soon = com[:, :, None] - ankles
+        velocity = (soon - now)[..., :2] / _DIFFERENCE_S
+        return now[..., 2:], velocity[np.arange(n), np.argmax(load, axis=1)]

@@ -1,0 +1,1 @@
+"""Stiffness, friction and offset of a joint from static positions."""

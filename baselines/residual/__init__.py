@@ -1,0 +1,1 @@
+"""Residuals: what they correct, what they see, their networks and their folders."""

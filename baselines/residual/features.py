@@ -1,0 +1,197 @@
+"""What a residual is decided by: groups of the observation, and what can be said from it, the plan and the model.
+
+| name | what it is |
+|---|---|
+| a group or a signal of the observation, such as `clock` or `clock.swing` | as it is in the observation |
+| `observation` | all of them |
+| `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
+| `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
+| `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
+| `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
+| `base_action` | what the base alone would command now [rad] |
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from baselines.estimation.bending import BendingObserver
+from baselines.estimation.ground_level import GroundLevel
+from baselines.residual.correction import Corrected
+from baselines.residual.mirror import LeftFirst
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.dynamics.ground_contact import FootSensors, zero_moment_point
+from elastic_env.robots.thormang.model import SIDES
+from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+
+OBSERVATION, BASE_ACTION = "observation", "base_action"
+_MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "wrench", "link_angle_imu")
+
+
+class Source(Protocol):
+    """Some features from observations, with a memory per world."""
+
+    memory_width: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What its features are, as in the table of the observation."""
+        ...
+
+    def begin(self, num_worlds: int) -> Array:
+        """Memory before the first measurement, (num_worlds, memory_width)."""
+        ...
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """Features of observations, (num_worlds, m) to (num_worlds, names), and the new memory."""
+        ...
+
+
+class Features:
+    """What a residual is decided by, in the order of the settings; the base's action and earlier measurements last.
+
+    Memory per world: measurements of the last decisions, the latest first, then that of the sources.
+
+    Args:
+        corrected: The base and its correction.
+
+    Raises:
+        ConfigurationError: A name that does not exist, or not for this robot.
+    """
+
+    def __init__(self, corrected: Corrected) -> None:
+        self._corrected, settings, model = corrected, corrected.settings, corrected.model
+        names = _named(settings.observe, model)
+        period_s = settings.decision_period * model.control_period_s
+        self._sources = [_source(name, model, period_s) for name in names]
+        self._acts = BASE_ACTION in settings.observe
+        widths = np.array([len(source.names) for source in self._sources], dtype=np.int64)
+        is_measured = np.repeat([name.split(".")[0] in _MEASUREMENTS for name in names], widths)
+        self._measured, self._history = np.flatnonzero(is_measured), settings.history
+        past = self._history * len(self._measured)
+        self._ends = np.cumsum([past, *(source.memory_width for source in self._sources)])
+        seen = [name for source in self._sources for name in source.names]
+        commanded = [f"{BASE_ACTION}.{joint}" for joint in model.joint_names] if self._acts else []
+        self.names = (*seen, *commanded)
+        self.width = len(self.names) + past
+        self.memory_width = int(self._ends[-1])
+        measured = [seen[i] for i in self._measured]
+        self._mirror = LeftFirst(self.names, measured, corrected) if settings.mirror else None
+
+    def at(
+        self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
+    ) -> tuple[Array, Array]:
+        """Features of a decision, and the memory for the next one.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            memory: That of the last decision, (num_worlds, memory_width); None at the first.
+            fresh: Worlds that decide for the first time in their episode.
+            state: State of the corrected policy.
+            episode_start: Worlds whose episode begins, for the policy.
+
+        Returns:
+            (num_worlds, width) and (num_worlds, memory_width).
+        """
+        n = len(rows)
+        begun = np.hstack([np.zeros((n, self._ends[0])), *(source.begin(n) for source in self._sources)])
+        memory, fresh = (begun, np.ones_like(fresh)) if memory is None else (memory, fresh)
+        past, *memories = np.split(np.where(fresh[:, None], begun, memory), self._ends[:-1], axis=1)
+        observed = [source.observe(rows, own) for source, own in zip(self._sources, memories, strict=True)]
+        seen = np.hstack([np.zeros((n, 0)), *(values for values, _ in observed)])
+        measured = seen[:, self._measured]
+        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), past)
+        parts = [seen]
+        if self._acts:
+            parts.append(np.asarray(self._corrected.base_action(rows, state, episode_start), dtype=np.float64))
+        remembered = np.hstack([measured, past])[:, : past.shape[1]]
+        features = np.hstack([*parts, past])
+        if self._mirror is not None:
+            features = self._mirror(rows, features)
+        return features, np.hstack([remembered, *(kept for _, kept in observed)])
+
+
+def _groups(model: RobotModel) -> list[str]:
+    """Groups of a robot's observation, in order."""
+    return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
+
+
+def _named(observe: tuple[str, ...], model: RobotModel) -> list[str]:
+    """Names of the sources, with all groups for the whole observation."""
+    names = [group for name in observe for group in (_groups(model) if name == OBSERVATION else [name])]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigurationError(f"observe must name everything once, {', '.join(twice)} are there twice")
+    return [name for name in names if name != BASE_ACTION]
+
+
+def _source(name: str, model: RobotModel, period_s: float) -> Source:
+    if name in _groups(model) or name in model.observation_table.names:
+        group = model.observation_table.group(name)
+        return _Instant(model.observation_table.names[group], lambda rows: rows[:, group])
+    if name == "encoder_error":
+        return _encoder_error(model)
+    if isinstance(model, WalkerModel) and name == "contact_error":
+        return _ContactError(model, period_s)
+    if isinstance(model, WalkerModel) and name == "level":
+        return GroundLevel(model, period_s)
+    if isinstance(model, WalkerModel) and name == "bending":
+        return BendingObserver(model)
+    further = ["encoder_error", *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
+    raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
+
+
+class _Instant:
+    """A source that remembers nothing."""
+
+    memory_width = 0
+
+    def __init__(self, names: tuple[str, ...], function: Callable[[Array], Array]) -> None:
+        self.names, self._function = names, function
+
+    def begin(self, num_worlds: int) -> Array:
+        return np.zeros((num_worlds, 0))
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        return self._function(rows), memory
+
+
+def _encoder_error(model: RobotModel) -> _Instant:
+    encoder, reference = (model.observation_table.group(name) for name in ("encoder_angle", "reference_angle"))
+    names = tuple(f"encoder_error.{joint}" for joint in model.joint_names)
+    return _Instant(names, lambda rows: rows[:, encoder] - rows[:, reference])
+
+
+class _ContactError:
+    """ZMP [m] and load share by the foot wrenches, as if the feet lay flat on their footholds, less the planned ones.
+
+    The wrenches are turned to level ground: there the plan was made. Zero where the feet carry too little
+    for a ZMP.
+    """
+
+    names = ("contact_error.x", "contact_error.y", "contact_error.share")
+    _LEAST_N = 50.0
+
+    def __init__(self, model: WalkerModel, period_s: float) -> None:
+        table, biped = model.observation_table, model.biped
+        self._level = GroundLevel(model, period_s)
+        self.memory_width = self._level.memory_width
+        self._share, self._zmp = table.group("load_share"), table.group("zmp_reference")
+        rigid = biped.rigid
+        feet = [rigid.body(f"{side}_foot").id for side in SIDES]
+        self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
+        self._ankles = biped.ankles
+
+    def begin(self, num_worlds: int) -> Array:
+        return self._level.begin(num_worlds)
+
+    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        _, wrenches, memory = self._level.upright(rows, memory)
+        wrench = wrenches.reshape(-1, 2, 2, 3)
+        force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))
+        zmp = zero_moment_point(force, moment, self._ankles, self._LEAST_N) - rows[:, self._zmp]
+        vertical = force[:, :, 2].sum(axis=1)
+        share = force[:, 1, 2] / np.where(vertical >= self._LEAST_N, vertical, np.nan) - rows[:, self._share][:, 0]
+        return np.nan_to_num(np.column_stack([zmp, share]), nan=0.0), memory

@@ -1,0 +1,145 @@
+"""The network of a residual in NumPy, and the tensors that make one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from safetensors import SafetensorError, safe_open
+
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.signals import Array
+
+Tensors = Mapping[str, npt.NDArray[Any]]
+"""`mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ..."""
+
+_BLOCK = 32
+"""Rows that are multiplied at once: a larger product would be shared out to threads, which then wait busily for more
+work in the way of the physics."""
+_ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
+_MOST_LAYERS, _MOST_BYTES, _LARGEST = 10, 100_000_000, 1e6
+_FILE_TYPES, _TYPES = ("F32", "F64"), ("float32", "float64")
+
+
+class NetworkSettings(Protocol):
+    """What a network is beside its tensors."""
+
+    @property
+    def activation(self) -> Literal["tanh", "relu"]:
+        """Between the layers."""
+        ...
+
+    @property
+    def output(self) -> Literal["clip", "tanh"]:
+        """How the last layer comes to [−1, 1]: clipped, or by tanh."""
+        ...
+
+    @property
+    def clip(self) -> float:
+        """Bound of normalised features, in standard deviations."""
+        ...
+
+
+def read_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Tensors of a file of safetensors.
+
+    Raises:
+        ConfigurationError: It is missing, cut short, too large, something else, or holds other than real numbers.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ConfigurationError(f"{path} must have at most {_MOST_BYTES} bytes, it has {path.stat().st_size}")
+        with safe_open(path, framework="np") as file:
+            for name in file.keys():  # noqa: SIM118  no mapping
+                if (kind := file.get_slice(name).get_dtype()) not in _FILE_TYPES:
+                    raise ConfigurationError(
+                        f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {kind}"
+                    )
+            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise ConfigurationError(
+            f"{path} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
+        ) from None
+
+
+def require_network(tensors: Tensors) -> int:
+    """The number of layers of tensors that make a network.
+
+    Raises:
+        ConfigurationError: Tensors that are missing, have a wrong shape or type, or are not finite.
+    """
+    depth = sum(name.startswith("weight") for name in tensors)
+    names = {"mean", "std", *(f"{kind}{i}" for i in range(depth) for kind in ("weight", "bias"))}
+    if not 1 <= depth <= _MOST_LAYERS or set(tensors) != names:
+        raise ConfigurationError(
+            f"weights must be mean, std, weight0, bias0, ... of at most {_MOST_LAYERS} layers; "
+            f"got {shown(sorted(tensors))}"
+        )
+    for name, tensor in tensors.items():
+        _require_numbers(name, tensor)
+    for name in ("mean", *(f"bias{i}" for i in range(depth))):
+        if tensors[name].ndim != 1 or len(tensors[name]) == 0:
+            raise ConfigurationError(f"{name} must have the shape (n,) with n >= 1, got {tensors[name].shape}")
+    widths = [len(tensors[name]) for name in ("mean", *(f"bias{i}" for i in range(depth)))]
+    for i in range(depth):
+        if (shape := tensors[f"weight{i}"].shape) != (widths[i + 1], widths[i]):
+            raise ConfigurationError(f"weight{i} must have the shape {(widths[i + 1], widths[i])}, got {shape}")
+    if tensors["std"].shape != tensors["mean"].shape or not (tensors["std"] > 0.0).all():
+        raise ConfigurationError(f"std must have one positive value per feature, {widths[0]} of them")
+    return depth
+
+
+def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
+    if tensor.dtype not in _TYPES:
+        raise ConfigurationError(f"{name} must be of type {' or '.join(_TYPES)}, got {tensor.dtype}")
+    largest = np.inf if name in ("mean", "std") else _LARGEST
+    if not np.isfinite(tensor).all() or (np.abs(tensor) > largest).any():
+        raise ConfigurationError(f"{name} must be finite, weights and biases within ±{_LARGEST:g}")
+
+
+class Network:
+    """Feed-forward network in single precision, as it was trained: the mean action of normalised features.
+
+    Rows of a batch agree with single rows to rounding only (10⁻⁶): a matrix product may add in another order.
+
+    Args:
+        settings: Activation, output and clipping.
+        tensors: `mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ...
+
+    Raises:
+        ConfigurationError: Tensors that are missing, not finite, or do not fit one another.
+    """
+
+    def __init__(self, settings: NetworkSettings, tensors: Tensors) -> None:
+        depth = require_network(tensors)
+        self._mean, self._std = tensors["mean"].astype(np.float64), tensors["std"].astype(np.float64)
+        self._layers = [
+            (tensors[f"weight{i}"].astype(np.float32).T, tensors[f"bias{i}"].astype(np.float32)) for i in range(depth)
+        ]
+        self._activation, self._output = _ACTIVATIONS[settings.activation], settings.output
+        self._clip = settings.clip
+
+    @property
+    def num_features(self) -> int:
+        """Width of the input."""
+        return len(self._mean)
+
+    @property
+    def num_outputs(self) -> int:
+        """Width of the output."""
+        return len(self._layers[-1][1])
+
+    def __call__(self, features: Array) -> Array:
+        """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
+        blocks = [self._forward(features[i : i + _BLOCK]) for i in range(0, len(features), _BLOCK)]
+        return np.concatenate(blocks) if blocks else np.zeros((0, self.num_outputs))
+
+    def _forward(self, features: Array) -> Array:
+        x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
+        for number, (W, b) in enumerate(self._layers):
+            x = x @ W + b
+            if number < len(self._layers) - 1:
+                x = self._activation(x)
+        x = np.tanh(x) if self._output == "tanh" else np.clip(x, -1.0, 1.0)
+        return x.astype(np.float64)

@@ -1,0 +1,227 @@
+"""Trained residuals as policies: a NumPy forward pass of weights from a folder, on top of the base they belong to.
+
+A folder holds `residual.json` (base, settings, network, how it was trained) and `weights.safetensors`. Loading it runs
+no code from it and needs no torch. The observation is normalised in here; the base policy sees it as it is.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field, field_validator
+from safetensors.numpy import save
+
+from baselines.compensation.policy import Action, ObservationView, Policy, resume
+from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.evidence import caution
+from baselines.residual.features import Features
+from baselines.residual.network import Network, Tensors, read_tensors
+from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
+from elastic_env.core.config_problems import ModelError
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.json_text import parse_json
+from elastic_env.core.signals import Array
+
+RESIDUAL = "residual:"
+"""Before the folder of a trained residual, where policies are named."""
+DESCRIPTION, WEIGHTS = "residual.json", "weights.safetensors"
+_SHIPPED = Path(__file__).parents[1] / "trained"
+
+
+class TrainedOn(Model):
+    """What comparisons read of the configuration of a training."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[], max_length=MOST_ENTRIES)
+    scenarios: list[Title] | None = Field(default=None, max_length=MOST_ENTRIES)
+    reference: str | float | list[float] | dict[str, Any] | None = None
+
+
+class Origin(Model):
+    """What comparisons read of how a residual was trained; the rest of it is for people."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    config: TrainedOn = TrainedOn()
+    seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    commit: Title | None = None
+
+
+class ResidualDescription(Model):
+    """What `residual.json` says of the weights beside it."""
+
+    robot: Title
+    """Task of the environment, walker or testbed."""
+    base: Title
+    """Name of the base policy."""
+    base_options: dict[str, Any] = {}
+    settings: ResidualSettings = ResidualSettings()
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Between the layers."""
+    output: Literal["clip", "tanh"] = "clip"
+    """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
+    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
+    training: dict[str, Any] = {}
+    """How it was trained: configuration, seed, versions, commit."""
+
+    @field_validator("base")
+    @classmethod
+    def _base_is_no_residual(cls, value: str) -> str:
+        return require_plain_base(value)
+
+    @field_validator("training")
+    @classmethod
+    def _origin_is_readable(cls, value: dict[str, Any]) -> dict[str, Any]:
+        Origin(**value)
+        return value
+
+    @property
+    def origin(self) -> Origin:
+        """How it was trained, as far as comparisons read it."""
+        return Origin(**self.training)
+
+
+def require_plain_base(name: str) -> str:
+    """The name of a base policy.
+
+    Raises:
+        ValueError: It is itself a residual, which could name another, or itself.
+    """
+    if name.startswith(RESIDUAL):
+        raise ValueError(f"the base of a residual must be no residual itself, got {name!r}; name a baseline")
+    return name
+
+
+class ResidualPolicy:
+    """A base policy with a network that corrects it.
+
+    Memory per world: control steps since the last decision, the residual that was decided, that of the features, and
+    that of caution.
+
+    Args:
+        corrected: The base and its correction.
+        network: What decides.
+
+    Raises:
+        ConfigurationError: The network does not fit the settings, or they do not fit the robot.
+    """
+
+    def __init__(self, corrected: Corrected, network: Network) -> None:
+        self.corrected, self._network = corrected, network
+        self._features, self._period = Features(corrected), corrected.settings.decision_period
+        expected = self._features.width, corrected.num_residuals
+        if (network.num_features, network.num_outputs) != expected:
+            raise ConfigurationError(
+                f"the network must take {expected[0]} features and give {expected[1]} residuals for these settings, "
+                f"it has {network.num_features} and {network.num_outputs}"
+            )
+        model = corrected.model
+        self._caution = caution(corrected)
+        self._ends = np.cumsum([1, corrected.num_residuals, self._features.memory_width])
+        self._view = ObservationView(model.observation_table, model.control_period_s)
+
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,  # noqa: ARG002  the interface's
+    ) -> tuple[Action, Any]:
+        """Corrected action and new state."""
+        rows = self._view.rows(observation)
+        memory, inner = resume(state, episode_start, rows, self._view, lambda: self._undecided(len(rows)))
+        due = np.flatnonzero((memory[:, 0] == 0.0) | (memory[:, 0] == _UNDECIDED))
+        if len(due) > 0:
+            memory = memory.copy()
+            fresh = memory[:, 0] == _UNDECIDED
+            _, _, past, known = np.split(memory, self._ends, axis=1)
+            features, past = self._features.at(rows, past, fresh, inner, episode_start)
+            trust, known = self._caution.observe(rows, np.where(fresh[:, None], self._caution.begin(len(rows)), known))
+            decided = self._network(features[due]) * trust[due]
+            memory[due] = np.hstack([np.zeros((len(due), 1)), decided, past[due], known[due]])
+        residual = memory[:, self._ends[0] : self._ends[1]]
+        action, inner = self.corrected.act(observation, residual, inner, episode_start)
+        counted = memory.copy()
+        counted[:, 0] = (memory[:, 0] + 1.0) % self._period
+        return action, (counted, inner)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """See `Corrected`."""
+        return self.corrected.link_estimate(observation, state[1])
+
+    def _undecided(self, num_worlds: int) -> Array:
+        memory = np.zeros((num_worlds, self._ends[-1] + self._caution.memory_width))
+        memory[:, 0] = _UNDECIDED
+        return memory
+
+
+_UNDECIDED = -1.0
+
+
+def save_residual(folder: Path, description: ResidualDescription, tensors: Tensors) -> None:
+    """Write a residual that `load_residual` reads; the network must be valid.
+
+    Raises:
+        ConfigurationError: Tensors that do not fit.
+    """
+    Network(description, tensors)
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+    (folder / WEIGHTS).write_bytes(weights)  # its own file writer has an error of its own for a full disk
+    (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def shipped() -> list[str]:
+    """Names of the residuals that come with the package, such as testbed/seed_0."""
+    return sorted(path.parent.relative_to(_SHIPPED).as_posix() for path in _SHIPPED.glob(f"*/*/{DESCRIPTION}"))
+
+
+def located(folder: Path) -> Path:
+    """A residual's folder: the path itself, or where nothing lies there, the one of that name in the package."""
+    own = _SHIPPED / folder
+    return own if not folder.exists() and own.exists() else folder
+
+
+def read_description(folder: Path) -> ResidualDescription:
+    """What a residual says of itself; `folder` is a path or the name of a shipped one.
+
+    Raises:
+        ConfigurationError: There is none, or it is not valid.
+    """
+    folder = located(folder)
+    try:
+        content = parse_json((folder / DESCRIPTION).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(
+            f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({error.strerror}), or the "
+            f"name of one that comes with the package: {', '.join(shipped())}"
+        ) from None
+    except ValueError as error:
+        raise ConfigurationError(f"{folder / DESCRIPTION} is not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{folder / DESCRIPTION} must be a mapping, got {type(content).__name__}")
+    try:
+        return ResidualDescription(**content)
+    except ModelError as error:
+        raise ConfigurationError(f"{folder / DESCRIPTION} describes no residual: {error.named()}") from None
+
+
+def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
+    """A residual from its folder.
+
+    Raises:
+        ConfigurationError: There is none, or it is damaged.
+    """
+    folder = located(folder)
+    description, tensors = read_description(folder), read_tensors(folder / WEIGHTS)
+    try:
+        return description, Network(description, tensors)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{folder / WEIGHTS} holds no network: {error}") from None
+
+
+def residual_policy(folder: Path, base: Policy, model: Any) -> ResidualPolicy:
+    """The policy of a residual's folder around its base."""
+    description, network = load_residual(folder)
+    return ResidualPolicy(Corrected(base, model, description.settings), network)

@@ -1,0 +1,179 @@
+"""What is wrong with the parameters of a model, in sentences that name each as its user wrote it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from pydantic import BaseModel, ValidationError
+
+from elastic_env.core.errors import ConfigurationError, choices_listed, shown
+
+ParameterPath = tuple[str | int, ...]
+"""Where a value stands: the keys and numbers of entries that lead to it."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong with a parameter.
+
+    Attributes:
+        path: Where it stands.
+        form: What the sentence says: of a parameter what it must be, of a model a rule that its parameters break, a
+            parameter that it has not, or one that it lacks.
+        text: The rest of the sentence.
+    """
+
+    path: ParameterPath
+    form: Literal["must", "rule", "unknown", "missing"]
+    text: str
+
+    def sentence(self, of_all: str, spelt: Callable[[ParameterPath], str]) -> str:
+        """The sentence.
+
+        Args:
+            of_all: Name of the outermost model; empty where its parameters go without.
+            spelt: How a parameter is written.
+        """
+        if self.form in ("must", "rule"):
+            name = spelt(self.path)
+            prefix = f"{of_all}." if of_all and name and self.form == "must" else ""
+            between = ": " if self.form == "rule" and name else " " if name else ""
+            return f"{prefix}{name}{between}{self.text}"
+        owner = spelt(self.path[:-1]) or of_all
+        own = shown(self.path[-1])
+        if self.form == "unknown":
+            return f"unknown parameter {f'of {owner} ' if owner else ''}{own}; {self.text}"
+        return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
+
+
+_MOST_SAID = 20
+
+
+def dotted(path: ParameterPath) -> str:
+    """A parameter as the keys that lead to it."""
+    return ".".join(part if isinstance(part, str) and len(part) < 100 else shown(part) for part in path)
+
+
+class ModelError(ConfigurationError):
+    """Parameters that do not fit a model; says all that is wrong with them.
+
+    Args:
+        model: Name of the model.
+        problems: What is wrong.
+    """
+
+    def __init__(self, model: str, problems: Sequence[Problem]) -> None:
+        super().__init__(model, problems)
+        self.model, self.problems = model, tuple(problems)
+
+    def __str__(self) -> str:
+        """All problems, one per line, in the words of who made the model in Python."""
+        return self.named(self.model)
+
+    def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
+        """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
+        sentences = list(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
+        more = [f"and {len(sentences) - _MOST_SAID} more"] if len(sentences) > _MOST_SAID else []
+        return "\n".join([*sentences[:_MOST_SAID], *more])
+
+
+def problems_of(model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]) -> list[Problem]:
+    """Problems that a validation found, those of models within the model among them.
+
+    Args:
+        model: What was validated.
+        error: What Pydantic says.
+        values: What was given.
+    """
+    return [found for problem in error.errors(include_url=False) for found in _problems(model, problem, values)]
+
+
+def _problems(model: type[BaseModel], problem: Mapping[str, Any], values: Mapping[str, Any]) -> list[Problem]:
+    path = _path(problem["loc"], values, is_missing=problem["type"] == "missing")
+    cause = problem.get("ctx", {}).get("error")
+    if isinstance(cause, ModelError):  # of a model within this one
+        return [replace(inner, path=(*path, *inner.path)) for inner in cause.problems]
+    return [_problem(model, path, problem)]
+
+
+def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, Any]) -> Problem:
+    given = shown(problem["input"])
+    match problem["type"]:
+        case "extra_forbidden":
+            return Problem(path, "unknown", choices_listed(path[-1], model.model_fields))
+        case "missing":
+            field = model.model_fields.get(str(path[-1]))
+            meaning = f": {field.description}" if field is not None and field.description else ""
+            return Problem(path, "missing", f"{_unit(model, path)}{meaning}")
+        case "value_error":
+            return Problem(path, "rule", str(problem["ctx"]["error"]))
+        case "model_type":
+            return Problem(path, "must", f"must be a mapping of parameters, got {given}")
+        case "too_short":
+            least = problem["ctx"]["min_length"]
+            return Problem(path, "must", f"must have at least {least} {_entries(least)}, got {given}")
+        case "too_long":
+            most = problem["ctx"]["max_length"]
+            return Problem(path, "must", f"must have at most {most} {_entries(most)}, got {given}")
+        case "string_too_long":
+            return Problem(path, "must", f"must have at most {problem['ctx']['max_length']} characters, got {given}")
+        case "string_pattern_mismatch":
+            meaning = model.model_fields[str(path[0])].description
+            return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
+    requirement = _bounds(model, path) or _KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be "))
+    return Problem(path, "must", f"must be {requirement}{_unit(model, path)}, got {given}")
+
+
+_KINDS = {
+    "string_type": "text", "dict_type": "a mapping", "list_type": "a list", "tuple_type": "a list",
+    "bool_type": "true or false", "bool_parsing": "true or false",
+}  # fmt: skip
+"""What a parameter must be, where Pydantic's words are not those of a configuration."""
+
+
+def _entries(number: int) -> str:
+    return "entry" if number == 1 else "entries"
+
+
+def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
+    """A location without what Pydantic adds to it: the member of a union that it tried, or that a tag chose."""
+    path: list[str | int] = []
+    for number, part in enumerate(location):
+        inside: Any = None
+        if isinstance(values, Mapping) and isinstance(part, str):
+            if part not in values and not (is_missing and number == len(location) - 1):
+                continue
+            inside = values.get(part)
+        elif isinstance(values, Sequence) and not isinstance(values, str) and isinstance(part, int):
+            inside = values[part] if part < len(values) else None
+        elif number > 0 and not isinstance(values, Mapping | None):
+            continue
+        path.append(part)
+        values = inside
+    return tuple(path)
+
+
+def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
+    """Requirement of a parameter with bounds, such as "a finite number > 0"; empty for one without."""
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    constraints = [
+        f"{sign} {_number(getattr(constraint, key))}"
+        for constraint in (field.metadata if field is not None else [])
+        for key, sign in signs.items()
+        if hasattr(constraint, key)
+    ]
+    whole = field is not None and "int" in str(field.annotation) and "float" not in str(field.annotation)
+    kind = "a whole number" if whole else "a finite number"
+    return f"{kind} {' and '.join(constraints)}" if constraints else ""
+
+
+def _number(bound: float) -> str:
+    """A bound, whole ones with all their digits."""
+    return f"{bound:d}" if isinstance(bound, int) else f"{bound:.6g}"
+
+
+def _unit(model: type[BaseModel], path: ParameterPath) -> str:
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    extra = field.json_schema_extra if field is not None else None
+    return f" [{extra['unit']}]" if isinstance(extra, dict) and extra["unit"] != "1" else ""

@@ -1,0 +1,63 @@
+"""JSON of bounded size, with finite numbers and text that a file can hold: what others may have written."""
+
+import json
+import math
+from typing import Any
+
+from elastic_env.core.yaml_text import DEEPEST_NESTING, LONGEST_NUMBER, NO_TEXT
+
+LARGEST_JSON = 1_000_000
+"""Characters of a text in JSON."""
+
+
+def parse_json(text: str) -> Any:
+    """What a text in JSON holds.
+
+    Raises:
+        ValueError: It is not JSON, is longer or deeper than the limits, or holds a key twice, a number that is not
+            finite or too long, or text with zero bytes.
+    """
+    if len(text) > LARGEST_JSON:
+        raise ValueError(f"it must have at most {LARGEST_JSON} characters, got {len(text)}")
+    try:
+        content = json.loads(
+            text, parse_int=_whole, parse_float=_real, parse_constant=_real, object_pairs_hook=_mapping
+        )
+    except RecursionError:
+        raise _TOO_DEEP from None
+    _require_plain(content, 0)
+    return content
+
+
+_TOO_DEEP = ValueError(f"mappings and lists must be nested at most {DEEPEST_NESTING} deep")
+
+
+def _whole(text: str) -> int:
+    if len(text) > LONGEST_NUMBER:
+        raise ValueError(f"a number must have at most {LONGEST_NUMBER} characters, got {len(text)}")
+    return int(text)
+
+
+def _real(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"numbers must be finite, got {text[:LONGEST_NUMBER]}")
+    return value
+
+
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    if len(set(keys)) < len(keys):
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice[:100]!r} stands twice in one mapping")
+    return dict(pairs)
+
+
+def _require_plain(value: Any, depth: int) -> None:
+    """Refuse values within too many others, and text that no file can hold."""
+    if depth > DEEPEST_NESTING:
+        raise _TOO_DEEP
+    if isinstance(value, str) and NO_TEXT.search(value):
+        raise ValueError("text must hold neither zero bytes nor halves of characters")
+    if isinstance(value, dict | list):
+        for part in [*value, *value.values()] if isinstance(value, dict) else value:
+            _require_plain(part, depth + 1)

@@ -1,0 +1,84 @@
+"""What a gait needs to know of a robot with two legs."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_chains import LegChains
+from elastic_env.dynamics.leg_kinematics import JOINTS, LegGeometry, leg_angles
+
+
+@dataclass(frozen=True, eq=False)
+class Biped:
+    """A robot with a left and a right leg of six hinges each.
+
+    Attributes:
+        rigid: Compiled rigid model with a free pelvis.
+        joint_names: The twelve hinges, left leg first, from hip to foot.
+        leg: Lengths of thigh and shank.
+        hips: Where the hip axes meet, left and right, in the pelvis frame, (2, 3) [m].
+        ankle_height: Height of the ankle axes over the sole [m].
+        sole_half_size: Half length and half width of the soles, whose middles lie under the ankles [m].
+    """
+
+    rigid: mujoco.MjModel
+    joint_names: tuple[str, ...]
+    leg: LegGeometry
+    hips: Array
+    ankle_height: float
+    sole_half_size: tuple[float, float]
+
+    @cached_property
+    def chains(self) -> LegChains:
+        """The legs for batches."""
+        return LegChains(self.rigid, self._legs)
+
+    @cached_property
+    def chains_above_feet(self) -> LegChains:
+        """The legs with feet that weigh nothing: what the sensors at the ankles do not carry."""
+        return LegChains(self.rigid, self._legs, feet_weigh=False)
+
+    @property
+    def _legs(self) -> list[tuple[str, ...]]:
+        half = len(JOINTS)
+        return [self.joint_names[:half], self.joint_names[half:]]
+
+    @cached_property
+    def weight(self) -> float:
+        """Weight of the whole robot [N]."""
+        return self.chains.mass * self.gravity
+
+    @cached_property
+    def gravity(self) -> float:
+        """Acceleration of gravity [m/s²]."""
+        return float(np.linalg.norm(self.rigid.opt.gravity))
+
+    @property
+    def footholds(self) -> Array:
+        """Middles of the soles where the robot walks in place, under the hips, (2, 2) [m]."""
+        return self.hips[:, :2]
+
+    @property
+    def ankles(self) -> Array:
+        """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
+        return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
+
+    def joint_angles(self, pelvis: Array, ankles: Array) -> Array:
+        """Inverse kinematics with level pelvis and soles.
+
+        Args:
+            pelvis: Position of the pelvis, (..., 3) [m].
+            ankles: Positions of the ankles, (..., 2, 3) [m].
+
+        Returns:
+            (..., 12) [rad].
+
+        Raises:
+            ElasticError: A foot is out of reach.
+        """
+        target = ankles - pelvis[..., None, :] - self.hips
+        level = np.broadcast_to(np.eye(3), (*target.shape, 3))
+        return leg_angles(self.leg, target, level).reshape(*pelvis.shape[:-1], 2 * len(JOINTS))

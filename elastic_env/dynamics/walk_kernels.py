@@ -1,0 +1,379 @@
+"""A control step of a walker after the physics, compiled: follow, read, stand, measure, score, observe.
+
+One pass over the worlds, from MuJoCo's state to the observation. A world's numbers depend on its own row alone. Rows
+have their fields by name, see `elastic_env.robots.thormang.rows`.
+
+Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
+file, and every size comes from a type.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from elastic_env.core.compiled import compiled
+from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
+
+FIRST_HALF, SECOND_HALF = 1, 2
+"""Of a swing; 0 is none."""
+
+
+class Physics(NamedTuple):
+    """MuJoCo's arrays that a step reads, one row per world."""
+
+    qpos: Array
+    qvel: Array
+    sensordata: Array
+    actuator_force: Array
+    site_xpos: Array
+    site_xmat: Array
+
+
+class Walker(NamedTuple):
+    """What does not change within an episode.
+
+    Attributes:
+        constants: Addresses, feet, sensors and rules, one row of `CONSTANTS`.
+        plan: One row per control step.
+        bias: Errors of homing and mounting, (n,).
+    """
+
+    constants: Any
+    plan: Any
+    bias: Any
+
+
+class Noise(NamedTuple):
+    """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,), which is counted here."""
+
+    samples: Any
+    used: IntArray
+
+
+class Outcome(NamedTuple):
+    """What a step fills beside the rows; `ends` is (4, n): diverged, fell, terminated, truncated."""
+
+    observed: Any
+    reward: Array
+    ends: BoolArray
+
+
+@compiled
+def command(rows: Any, offset: Array, walker: Walker, inputs: Array) -> None:
+    """Servo inputs of the coming control period, q_ref + offset, by encoders that are off by a bias, (n, 12) [rad]."""
+    for world in range(len(offset)):
+        coming, bias = row_of(walker.plan, rows[world].truth.step + 1), walker.bias[world]
+        for i in range(offset.shape[1]):
+            inputs[world, i] = coming.q[i] + offset[world, i] - bias.encoder[i]
+
+
+@compiled
+def begin(physics: Physics, walker: Walker, noise: Noise, worlds: BoolArray, rows: Any) -> None:
+    """Truth and measurements at the start of an episode in some worlds, whose encoders have been at rest."""
+    constants, feet = walker.constants[0], feet_to_be_filled()
+    for world in range(len(rows)):
+        if worlds[world]:
+            truth, shown = rows[world].truth, rows[world].measured
+            read(physics, constants.at, world, truth)
+            stand(physics, constants, world, truth, feet)
+            measure(truth, sample_of(noise, world), walker.bias[world], constants.quality, True, shown)
+            shown.encoder_before[:] = shown.encoder
+
+
+@compiled
+def control_step(
+    physics: Physics, walker: Walker, noise: Noise, commanded: tuple[Array, BoolArray], last: Any, now: Any,
+    outcome: Outcome,
+) -> bool:  # fmt: skip
+    """Everything after the physics.
+
+    Args:
+        physics: State of all worlds.
+        walker: What does not change.
+        noise: Of the sensors.
+        commanded: Offsets of this control period, (n, 12) [rad], and the worlds that diverged under them, (n,). These
+            keep truth and measurements.
+        last: Rows of the step before, (n,).
+        now: To be filled, (n,).
+        outcome: To be filled.
+
+    Returns:
+        Whether an episode ends.
+    """
+    offset, diverged = commanded
+    is_over, constants, feet = False, walker.constants[0], feet_to_be_filled()
+    rules = constants.rules
+    for world in range(len(offset)):
+        now[world] = last[world]
+        truth, shown, scores = now[world].truth, now[world].measured, now[world].scores
+        truth.step += 1
+        planned = row_of(walker.plan, truth.step)
+        follow(truth, planned, offset[world], rules.control_period_s)
+        if not diverged[world]:
+            read(physics, constants.at, world, truth)
+            stand(physics, constants, world, truth, feet)
+            bias = walker.bias[world]
+            measure(truth, sample_of(noise, world), bias, constants.quality, planned.imu_is_due, shown)
+        watch_swing_foot(truth, planned, rules.loaded_n)
+        is_last = truth.step >= len(walker.plan) - 1
+        is_over = end(truth, rules, diverged[world], is_last, outcome.ends[:, world]) or is_over
+        outcome.reward[world] = score(truth, planned, rules.weights, outcome.ends[-2, world], scores)
+        visible = last[world].measured if rules.is_delayed else shown
+        coming = row_of(walker.plan, truth.step + 1)
+        observe(truth, visible, coming, rules.control_period_s, outcome.observed[world])
+    return is_over
+
+
+@compiled
+def show(rows: Any, shown: Any, walker: Walker, observed: Any) -> None:
+    """Observations of the present state; `shown` are the rows whose measurements are shown."""
+    period_s = walker.constants[0].rules.control_period_s
+    for world in range(len(rows)):
+        coming = row_of(walker.plan, rows[world].truth.step + 1)
+        observe(rows[world].truth, shown[world].measured, coming, period_s, observed[world])
+
+
+@compiled
+def row_of(plan: Any, step: int) -> Any:
+    """The plan's row of a step; its last one from the end on."""
+    return plan[min(step, len(plan) - 1)]
+
+
+@compiled
+def sample_of(noise: Noise, world: int) -> Any:
+    """The next sample of a world."""
+    used = noise.used[world]
+    noise.used[world] += 1
+    return noise.samples[min(used, len(noise.samples) - 1), world]
+
+
+@compiled
+def follow(row: Any, planned: Any, offset: Array, period_s: float) -> None:
+    """Keep what was commanded, and how fast it changed."""
+    total = 0.0
+    for i in range(len(offset)):
+        change = offset[i] - row.offset[i]
+        total += change * change
+        row.offset[i], row.command[i] = offset[i], planned.q[i] + offset[i]
+    row.command_rate = math.sqrt(total / len(offset)) / period_s
+
+
+@compiled
+def read(physics: Physics, at: Any, world: int, row: Any) -> None:
+    """State of a world as the physics has it; MuJoCo's wrench acts on the foot, ours on the leg."""
+    qpos, qvel = physics.qpos[world], physics.qvel[world]
+    for i in range(len(row.theta)):
+        row.theta[i], row.theta_dot[i] = qpos[at.theta[i]], qvel[at.theta_dot[i]]
+        row.q[i], row.q_dot[i] = qpos[at.q[i]], qvel[at.q_dot[i]]
+        row.servo_torque[i] = physics.actuator_force[world, i]
+    for i in range(3):
+        row.pelvis[i], row.pelvis_rate[i] = qpos[i], qvel[3 + i]
+    for i in range(4):
+        row.quaternion[i] = qpos[3 + i]
+    for foot in range(2):
+        for i in range(3):
+            row.ankles[foot, i] = physics.site_xpos[world, at.ankles[foot], i]
+            row.wrench[foot, 0, i] = -physics.sensordata[world, 6 * foot + i]
+            row.wrench[foot, 1, i] = -physics.sensordata[world, 6 * foot + 3 + i]
+    row.roll, row.pitch, row.tilt = attitude_of(row.quaternion)
+
+
+@compiled
+def attitude_of(quaternion: Array) -> tuple[float, float, float]:
+    """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad]."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    # the vertical in the frame of the pelvis
+    up_x, up_y, up_z = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    pitch = math.asin(min(max(-up_x, -1.0), 1.0))
+    return math.atan2(up_y, up_z), pitch, math.atan2(math.hypot(up_x, up_y), up_z)
+
+
+@compiled
+def feet_to_be_filled() -> tuple[Array, Array, Array]:
+    """Orientation of two feet, (2, 3, 3), force and moment of the ground on them, (2, 3) each, for `stand`."""
+    return np.empty((2, 3, 3)), np.empty((2, 3)), np.empty((2, 3))
+
+
+@compiled
+def stand(physics: Physics, constants: Any, world: int, row: Any, feet: tuple[Array, Array, Array]) -> None:
+    """Force of the ground on the feet, and the ZMP."""
+    foot_R, force, moment = feet
+    for foot in range(2):
+        for i in range(3):
+            for j in range(3):
+                foot_R[foot, i, j] = physics.site_xmat[world, constants.at.ankles[foot], 3 * i + j]
+    ground_wrench(row.wrench, foot_R, constants.foot_com, constants.foot_weight, force, moment)
+    moment_point(force, moment, row.ankles, constants.rules.zmp_n, row.zmp)
+    row.force[0], row.force[1] = force[0, 2], force[1, 2]
+
+
+@compiled
+def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
+    """Since when the swing foot has been on the ground in the second half of its swing."""
+    if planned.half_of_swing == FIRST_HALF:
+        row.contact_since = -1
+    if planned.half_of_swing == SECOND_HALF and row.contact_since < 0 and row.force[planned.swing_foot] > loaded_n:
+        row.contact_since = row.step
+
+
+@compiled
+def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, shown: Any) -> None:
+    """What encoders, IMU and foot sensors show; an IMU that is not due shows its last sample."""
+    for i in range(len(shown.encoder)):
+        shown.encoder_before[i] = shown.encoder[i]
+        shown.encoder[i] = in_whole_counts(row.theta[i] + bias.encoder[i], quality.count_rad)
+    for foot in range(2):
+        for i in range(3):
+            force, moment = row.wrench[foot, 0, i], row.wrench[foot, 1, i]
+            shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.force_noise_n + force
+            shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.moment_noise_nm + moment
+    if imu_is_due:
+        shown.imu_attitude[0] = shown_angle(row.roll, bias.imu_attitude[0], noise.imu_attitude[0], quality)
+        shown.imu_attitude[1] = shown_angle(row.pitch, bias.imu_attitude[1], noise.imu_attitude[1], quality)
+        for i in range(3):
+            shown.imu_rate[i] = noise.imu_rate[i] * quality.gyro_noise_rad_s + row.pelvis_rate[i]
+
+
+@compiled
+def in_whole_counts(angle: float, count_rad: float) -> float:
+    """The nearest whole counts of an encoder, as an angle [rad]; counts of 0 leave it as it is."""
+    return np.rint(angle / count_rad) * count_rad if count_rad > 0.0 else angle
+
+
+@compiled
+def shown_angle(angle: float, drawn_bias: float, noise: float, quality: Any) -> float:
+    """An angle by the IMU, see `elastic_env.runtime.sensors.attitude` [rad]."""
+    constant = quality.imu_bias_rad + quality.imu_sine_error_rad * np.sin(angle)
+    return angle + drawn_bias + quality.imu_noise_rad * noise + constant
+
+
+@compiled
+def end(row: Any, rules: Any, has_diverged: bool, is_last: bool, ends: BoolArray) -> bool:
+    """Say what ends the episode of a world, if anything does; speeds beyond all physics are no fall."""
+    for i in range(len(row.theta_dot)):
+        fastest = max(abs(row.theta_dot[i]), abs(row.q_dot[i]))
+        has_diverged = has_diverged or fastest > rules.highest_rad_s
+    is_down = row.pelvis[2] < rules.lowest_pelvis_m or row.tilt > rules.highest_tilt_rad
+    has_fallen = is_down and not has_diverged
+    is_terminated = has_diverged or has_fallen
+    ends[0], ends[1], ends[2], ends[3] = has_diverged, has_fallen, is_terminated, is_last and not is_terminated
+    return is_terminated or is_last
+
+
+@compiled
+def score(row: Any, planned: Any, weights: Any, is_terminated: bool, terms: Any) -> float:
+    """Weighted terms of the reward, and their sum."""
+    deviation = math.hypot(row.zmp[0] - planned.zmp[0], row.zmp[1] - planned.zmp[1])
+    terms.tilt = weights.tilt * planned.weight * tilt_penalty(row.tilt)
+    terms.zmp = weights.zmp * planned.weight * zmp_penalty(deviation)
+    terms.effort = weights.effort * effort_penalty(row.servo_torque)
+    terms.smoothness = weights.smoothness * smoothness_penalty(row.command_rate)
+    terms.fall = weights.fall * fall_penalty(is_terminated)
+    return terms.tilt + terms.zmp + terms.effort + terms.smoothness + terms.fall
+
+
+@compiled
+def tilt_penalty(tilt: Parameter) -> Any:
+    """−|tilt| [rad]: linear, so that a large error never stops to matter."""
+    return -np.abs(tilt)
+
+
+@compiled
+def zmp_penalty(zmp_deviation: Parameter) -> Any:
+    """−ZMP deviation [m], a distance; none where the feet are not loaded and it is nan."""
+    return -np.fmax(zmp_deviation, 0.0)
+
+
+@compiled
+def effort_penalty(servo_torque: Array) -> float:
+    """−rms of the servos' torques over the joints [N·m]."""
+    return -rms(servo_torque)
+
+
+@compiled
+def smoothness_penalty(command_rate: float) -> float:
+    """−rms over the joints of the change of the offsets [rad/s]."""
+    return -command_rate
+
+
+@compiled
+def fall_penalty(is_terminated: bool) -> float:
+    """−1 in the step in which the robot falls or the simulation diverges."""
+    return -1.0 if is_terminated else 0.0
+
+
+@compiled
+def observe(row: Any, shown: Any, coming: Any, period_s: float, observed: Any) -> None:
+    """What a policy sees, see the table of `elastic_env.robots.thormang.task`."""
+    for i in range(len(observed.encoder_angle)):
+        observed.encoder_angle[i] = shown.encoder[i]
+        observed.encoder_rate[i] = (shown.encoder[i] - shown.encoder_before[i]) / period_s
+        observed.reference_angle[i], observed.reference_rate[i] = coming.q[i], coming.q_dot[i]
+        observed.reference_acceleration[i], observed.last_command[i] = coming.q_ddot[i], row.command[i]
+    observed.imu_attitude[:], observed.imu_rate[:], observed.wrench[:] = (
+        shown.imu_attitude,
+        shown.imu_rate,
+        shown.wrench,
+    )
+    observed.clock[:], observed.load_share, observed.zmp_reference[:] = coming.clock, coming.share, coming.zmp
+
+
+@compiled
+def rms(values: Array) -> float:
+    """Root of the mean square, added in order."""
+    total = 0.0
+    for value in values:
+        total += value * value
+    return math.sqrt(total / len(values))
+
+
+@compiled
+def rms_of_rows(values: Array) -> Array:
+    """`rms` of every row of (n, m)."""
+    found = np.empty(len(values))
+    for row in range(len(values)):
+        found[row] = rms(values[row])
+    return found
+
+
+@compiled
+def ground_wrench(sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array) -> None:
+    """Wrench of the ground on the feet of one robot, see `FootSensors`: into `force` and `moment`, (L, 3)."""
+    c = np.empty(3)
+    for foot in range(len(sensors)):
+        R, (f, n), w = foot_R[foot], sensors[foot], weight[foot]
+        for i in range(3):
+            c[i] = R[i, 0] * com[foot, 0] + R[i, 1] * com[foot, 1] + R[i, 2] * com[foot, 2]
+            force[foot, i] = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2] - w[i]
+            moment[foot, i] = R[i, 0] * n[0] + R[i, 1] * n[1] + R[i, 2] * n[2]
+        moment[foot, 0] -= c[1] * w[2] - c[2] * w[1]
+        moment[foot, 1] -= c[2] * w[0] - c[0] * w[2]
+        moment[foot, 2] -= c[0] * w[1] - c[1] * w[0]
+
+
+@compiled
+def moment_point(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
+    """ZMP of one robot, see `zero_moment_point`: into `zmp`, (2,)."""
+    about_x = about_y = vertical = 0.0
+    for foot in range(len(force)):
+        f, n, p = force[foot], moment[foot], ankle[foot]
+        about_x += p[1] * f[2] - p[2] * f[1] + n[0]
+        about_y += p[2] * f[0] - p[0] * f[2] + n[1]
+        vertical += f[2]
+    scale = vertical if vertical >= least_n else np.nan
+    zmp[0], zmp[1] = -about_y / scale, about_x / scale
+
+
+@compiled
+def ground_wrenches(sensors: Array, foot_R: Array, com: Array, weight: Array, force: Array, moment: Array) -> None:
+    """`ground_wrench` of several robots."""
+    for row in range(len(sensors)):
+        ground_wrench(sensors[row], foot_R[row], com, weight, force[row], moment[row])
+
+
+@compiled
+def moment_points(force: Array, moment: Array, ankle: Array, least_n: float, zmp: Array) -> None:
+    """`moment_point` of several robots."""
+    for row in range(len(force)):
+        moment_point(force[row], moment[row], ankle[row], least_n, zmp[row])

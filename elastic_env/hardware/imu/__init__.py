@@ -1,0 +1,1 @@
+"""The IMU on the link, read in a process of its own."""

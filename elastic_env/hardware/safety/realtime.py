@@ -1,0 +1,105 @@
+"""Processes that must not wait for others, and the time they keep."""
+
+import contextlib
+import gc
+import os
+import time
+from enum import IntEnum
+
+from elastic_env.hardware.safety.bounds import exceeds
+
+
+class Priority(IntEnum):
+    """Who goes before whom: what ends a motion before what moves, however busy that is."""
+
+    LOOP = 5
+    IMU_READER = 10
+    SUPERVISOR = 15
+    EMULATOR = 20
+
+
+def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
+    """Ask for real-time scheduling of this thread; whether the system grants it (it needs the right to, see docs).
+
+    What is in memory now is left out of garbage collections: one that looks at all of it takes ten control periods.
+
+    Args:
+        priority: Among the processes of a motion.
+        with_threads: Whether threads and programs that it starts from now on get the same; else they run as others do.
+    """
+    gc.collect()
+    gc.freeze()
+    with contextlib.suppress(OSError, AttributeError):
+        policy = os.SCHED_FIFO if with_threads else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+        return True
+    return False
+
+
+def schedule_like(thread_id: int) -> None:
+    """Schedule this thread as another of this program is.
+
+    Args:
+        thread_id: Native id of the other.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.sched_getscheduler(thread_id), os.sched_getparam(thread_id))
+
+
+def give_up_realtime() -> None:
+    """Back to the scheduling of all others, and to collections of everything."""
+    gc.unfreeze()
+    with contextlib.suppress(OSError, AttributeError):  # the flag may be taken back with special rights only
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def sleep_until(moment_s: float) -> None:
+    """Wait for a moment of the monotonic clock."""
+    remaining = moment_s - time.monotonic()
+    if remaining > 0.0:
+        time.sleep(remaining)
+
+
+class Pace:
+    """Moments at which a control loop reads, one period after the other.
+
+    Small delays are caught up with. An overrun is a period whose command comes, or whose reading happens, more than
+    half a period late: a new one begins there, so that one hold-up counts once and what follows has its whole time.
+
+    Args:
+        period_s: Time between readings [s].
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self.restart()
+
+    def restart(self) -> None:
+        """A period begins now."""
+        self._due_s, self._lost_s = time.monotonic(), 0.0
+
+    def next(self) -> float:
+        """When to read, for a command that is ready now: not before now [s, monotonic clock]."""
+        now = time.monotonic()
+        self._due_s += self._period_s
+        self._lost_s = now - self._due_s
+        if not self.is_overrun(self._lost_s):
+            self._lost_s = 0.0
+            return max(self._due_s, now)
+        self._due_s = now + self._period_s
+        return self._due_s
+
+    def late(self, moment_s: float) -> float:
+        """How late the last period was read, or its command came [s].
+
+        Args:
+            moment_s: When it was read [s, monotonic clock].
+        """
+        late_s = moment_s - self._due_s
+        if self.is_overrun(late_s):
+            self._due_s = moment_s
+        return self._lost_s + late_s
+
+    def is_overrun(self, late_s: float) -> bool:
+        """Whether a period was lost that was so late."""
+        return bool(exceeds(late_s, 0.5 * self._period_s))

@@ -1,0 +1,146 @@
+"""Packets of Dynamixel Protocol 2.0: checksum, byte stuffing, instructions and status [ROBOTIS e-manual, protocol2].
+
+    FF FF FD 00  id  length (2)  instruction  parameters ...  CRC-16 (2)
+
+Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a header never occurs there; length and
+checksum count what is sent.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from elastic_env.core.errors import ConfigurationError
+
+HEADER = b"\xff\xff\xfd\x00"
+BROADCAST = 0xFE
+LARGEST_ID = 0xFC
+STATUS = 0x55
+
+PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, REBOOT = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08
+SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A
+BULK_READ, BULK_WRITE, FAST_BULK_READ = 0x92, 0x93, 0x9A
+
+ALERT = 0x80
+"""Bit of a status that says: read `hardware_error_status`."""
+
+RESULT_FAIL, INSTRUCTION_ERROR, CRC_ERROR = 0x01, 0x02, 0x03
+RANGE_ERROR, LENGTH_ERROR, LIMIT_ERROR, ACCESS_ERROR = 0x04, 0x05, 0x06, 0x07
+STATUS_ERRORS = {
+    RESULT_FAIL: "it could not process the instruction",
+    INSTRUCTION_ERROR: "it does not know the instruction",
+    CRC_ERROR: "the instruction arrived damaged",
+    RANGE_ERROR: "the value is out of the register's range",
+    LENGTH_ERROR: "the length does not fit the register",
+    LIMIT_ERROR: "the value is beyond the servo's limit",
+    ACCESS_ERROR: "the register cannot be read or written now; EEPROM is locked while torque is on",
+}
+"""What the number in a status means."""
+
+_POLYNOMIAL = 0x8005
+RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
+"""Rates that servos, SDK and pseudo-terminals share, the likeliest first [bit/s]."""
+_LONGEST = 1024
+_STUFFED = b"\xff\xff\xfd"
+
+
+def require_ids(ids: Sequence[int]) -> None:
+    """Check the ids of the servos on a bus.
+
+    Raises:
+        ConfigurationError: None are given, one of them twice, or one that no servo can have.
+    """
+    if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
+        raise ConfigurationError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {list(ids)}")
+
+
+def _crc_of_byte(byte: int) -> int:
+    value = byte << 8
+    for _ in range(8):
+        value = (value << 1) ^ _POLYNOMIAL if value & 0x8000 else value << 1
+    return value & 0xFFFF
+
+
+_CRC_TABLE = [_crc_of_byte(byte) for byte in range(256)]
+
+
+def crc16(data: bytes, crc: int = 0) -> int:
+    """CRC-16 of polynomial 0x8005, from zero, not reflected."""
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
+    return crc
+
+
+def stuff(body: bytes) -> bytes:
+    """Instruction and parameters as they are sent: FD behind every FF FF FD."""
+    return body.replace(_STUFFED, _STUFFED + b"\xfd")
+
+
+def unstuff(body: bytes) -> bytes:
+    """What `stuff` was given."""
+    return body.replace(_STUFFED + b"\xfd", _STUFFED)
+
+
+def packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """A packet as it goes over the wire."""
+    body = stuff(bytes([instruction]) + parameters)
+    head = HEADER + bytes([servo_id]) + (len(body) + 2).to_bytes(2, "little") + body
+    return head + crc16(head).to_bytes(2, "little")
+
+
+def status(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
+    """A servo's reply."""
+    return packet(servo_id, STATUS, bytes([error]) + parameters)
+
+
+@dataclass(frozen=True)
+class Packet:
+    """A received packet without its stuffing."""
+
+    servo_id: int
+    instruction: int
+    parameters: bytes
+    is_intact: bool = True
+    """Whether the checksum fits; of a packet that is not intact only the id is of use."""
+
+
+class Parser:
+    """Finds packets in a stream of bytes that may begin anywhere."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """The packets that are complete with these bytes, in order."""
+        self._bytes += data
+        found = []
+        while (one := self._next()) is not None:
+            found.append(one)
+        return found
+
+    def _next(self) -> Packet | None:
+        while True:
+            start = self._bytes.find(HEADER)
+            if start < 0:
+                del self._bytes[: max(len(self._bytes) - len(HEADER) + 1, 0)]
+                return None
+            del self._bytes[:start]
+            if len(self._bytes) < 7:
+                return None
+            length = int.from_bytes(self._bytes[5:7], "little")
+            if not 3 <= length <= _LONGEST:
+                del self._bytes[: len(HEADER)]
+                continue
+            raw = bytes(self._bytes[: 7 + length])
+            is_whole = len(raw) == 7 + length
+            is_intact = is_whole and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
+            # in what is stuffed no header occurs, with the checksum behind it one may: only where the packet is not
+            # intact does a header before its end mean that the rest was lost
+            again = self._bytes.find(HEADER, len(HEADER))
+            if not is_intact and 0 < again < 7 + length:
+                del self._bytes[:again]
+                continue
+            if not is_whole:
+                return None
+            del self._bytes[: 7 + length]
+            body = unstuff(raw[7:-2])
+            return Packet(raw[4], body[0], body[1:], is_intact)

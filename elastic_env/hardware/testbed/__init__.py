@@ -1,0 +1,1 @@
+"""The testbed on hardware, as an environment."""

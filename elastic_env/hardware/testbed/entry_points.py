@@ -1,0 +1,71 @@
+"""Entry point of the registered environment on hardware: arguments of `gymnasium.make` become a task on a plant."""
+
+import inspect
+from functools import partial
+from typing import Any
+
+from gymnasium.vector import AutoresetMode
+
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.entry_points import configure_testbed
+from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.hardware.testbed.task import HardwareTestbedTask
+from elastic_env.robots.testbed.picture import TestbedPicture
+from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+
+_ID = "elastic_env/HardwareTestbed-v0"
+SCENARIO = "hardware"
+"""What stands for the scenario in tables of results."""
+_OF_A_SIMULATION = ("form", "timestep_s")
+
+
+def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTestbedTask:
+    """The task of `gymnasium.make("elastic_env/HardwareTestbed-v0", port=..., ...)`.
+
+    Args:
+        port: Port of the servo.
+        **arguments: Those of `HardwareSettings`, and of `elastic_env.entry_points.configure_testbed` but for `form` and
+            `timestep_s`; `scenario` can only be "hardware" or "nominal", and changes nothing.
+
+    Raises:
+        ConfigurationError: A name, a parameter or a combination that does not exist.
+    """
+    if port is None:
+        raise ConfigurationError(f"{_ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT")
+    of_settings = [name for name in HardwareSettings.model_fields if name != "port"]
+    of_testbed = [name for name in inspect.signature(configure_testbed).parameters if name not in _OF_A_SIMULATION]
+    for name in arguments:
+        if name not in (*of_settings, *of_testbed):
+            raise unknown_name(f"argument of {_ID}", name, ["port", *of_settings, *of_testbed])
+    scenario = arguments.pop("scenario", SCENARIO)
+    if scenario not in (SCENARIO, "nominal"):
+        raise HardwareError(f"a scenario is of a simulation; on hardware it is what it is, got {scenario!r}")
+    settings = HardwareSettings(port=port, **{name: arguments.pop(name) for name in of_settings if name in arguments})
+    config = configure_testbed(scenario="ideal", **arguments)
+    return HardwareTestbedTask(config, settings)
+
+
+def make_hardware_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
+    """Entry point; arguments as in `configure_hardware`."""
+    task = configure_hardware(**arguments)
+    return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
+
+
+def make_hardware_testbed_vector(
+    num_envs: int = 1,
+    num_threads: int = 0,  # noqa: ARG001  the same arguments as the other environments
+    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    render_mode: str | None = None,
+    **arguments: Any,
+) -> ElasticVectorEnv:
+    """Vector entry point, for the same programs to run on hardware: of one world.
+
+    Raises:
+        ConfigurationError: More than one world.
+    """
+    if num_envs != 1:
+        raise ConfigurationError(f"there is one testbed at a port: num_envs must be 1, got {shown(num_envs)}")
+    task = configure_hardware(**arguments)
+    picture = partial(TestbedPicture, task.config.pendulum)
+    return ElasticVectorEnv(task, 1, autoreset_mode, task.plant, render_mode, picture)

@@ -1,0 +1,290 @@
+"""Servo and IMU in the place of the physics: one control cycle on the bus is one advance of a `Simulation`."""
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.imu.attitude import AttitudeStream, link_angle
+from elastic_env.hardware.safety.bounds import exceeds
+from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
+from elastic_env.hardware.safety.supervised import Cycle, SupervisedBus
+from elastic_env.hardware.servo_bus.torque_line import torque_of_current
+from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.motion.trajectory import QUINTIC_PEAK_RATE, minimum_jerk
+
+_SHORTEST_MOVE_S = 0.5
+_SETTLE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How well the last control period was kept; counts are of the episode."""
+
+    jitter_s: float = 0.0
+    """How late the reading was, or the command for it [s]."""
+    period_s: float = 0.0
+    """Time since the reading before [s]."""
+    overruns: int = 0
+    """Periods that were more than half a period late, see `Pace`."""
+    missed_replies: int = 0
+    """Cycles without a usable reply; the last command was held and the cycle repeated."""
+    limited: int = 0
+    """Cycles in which the safety limits changed the command."""
+
+
+class ServoPlant:
+    """A servo on a bus, an IMU on its link; see `elastic_env.runtime.physics.Simulation`.
+
+    Nothing is opened before the first `begin`. What cannot be measured is nan: the link's rate, and without an IMU its
+    angle.
+
+    Args:
+        model: The testbed's model, whose state vectors it fills.
+        at: Where motor and link angle stand in them.
+        settings: Wiring, mounting and limits.
+        period_s: Control period [s].
+        pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first motion [N·m].
+    """
+
+    num_worlds = 1
+
+    def __getstate__(self) -> dict[str, object]:
+        """There is one joint at a port, and no copy of it.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError("an environment on hardware cannot be copied or pickled: there is one joint at its port")
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        at: JointAddresses,
+        settings: HardwareSettings,
+        period_s: float,
+        pendulum_nm: float,
+    ) -> None:
+        self.model, self.settings = model, settings
+        self.qpos: Array = np.full((1, model.nq), np.nan)
+        self.qvel: Array = np.full((1, model.nv), np.nan)
+        self.act: Array = np.zeros((1, model.na))
+        self.ctrl: Array = np.zeros((1, model.nu))
+        self.motor_torque = np.full(1, np.nan)
+        self.timing = Timing()
+        self._at, self._period_s, self._pendulum_nm = at, period_s, pendulum_nm
+        self._bus: SupervisedBus | None = None
+        self._imu: AttitudeStream | None = None
+        self._is_agreed = not settings.confirm
+        self._pace = Pace(period_s)
+        self._goal = self._read_s = 0.0
+        self._is_kept = False
+
+    def __del__(self) -> None:
+        """A testbed that nobody holds any more gives its ports back."""
+        with suppress(Exception):
+            self.close()
+
+    def begin(self, angle: float) -> None:
+        """Torque on, slowly to an angle, and wait there.
+
+        Args:
+            angle: Of the joint's motor side [rad].
+
+        Raises:
+            HardwareError: Nobody agreed, or something of the hardware is not as it must be.
+        """
+        self._agree(angle)
+        with self._or_closed():
+            bus = self._opened()
+            bus.disable()
+            start = self.settings.joint_angle(float(bus.enable(self.settings.servo_limits)[0]))
+            self._restart_clock()
+            self._move(start, angle)
+            self._cycles(angle, _SETTLE_S)
+            self.timing = Timing()
+            bus.keep(self._servo_goal(angle))
+            self._is_kept = True
+
+    def advance(self, num_substeps: int) -> None:  # noqa: ARG002  one period, whatever the physics would make of it
+        """Command `ctrl`, wait for the end of the control period, read.
+
+        Raises:
+            HardwareError: No episode is under way, or something of the hardware is not as it must be.
+        """
+        if self._bus is None:
+            raise HardwareError(f"no episode is under way at {self.settings.port}: begin one with reset()")
+        with self._or_closed():
+            if self._is_kept:  # the first step may come any time after the reset
+                self._opened().stop_keeping()
+                self._restart_clock()
+                self._is_kept = False
+            self._cycle(float(self.ctrl[0, 0]))
+
+    def finish(self) -> None:
+        """Slowly back to where the pendulum hangs, then torque off; the ports are free for other programs."""
+        try:
+            self._move(self._goal, 0.0)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Torque off; ports closed. An error or an interrupt on whose way out this happens gets a note of it."""
+        bus, self._bus = self._bus, None
+        imu, self._imu = self._imu, None
+        try:
+            if bus is not None:
+                bus.close()
+                why = sys.exception()
+                if why is not None and bus.is_confirmed_off:
+                    why.add_note(f"torque at {self.settings.port} is off")
+        finally:
+            if imu is not None:
+                imu.close()
+            if bus is not None:
+                give_up_realtime()
+
+    def restart(self, worlds: BoolArray) -> None:
+        """See `Simulation`; an episode begins with `begin`."""
+
+    def diverged(self) -> BoolArray:
+        """Hardware does not diverge: where something is wrong, an error says what."""
+        return np.zeros(1, dtype=np.bool_)
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """See `Simulation`; hardware has nothing to compute."""
+
+    def bind(self, field: str) -> Array:
+        """Hardware has no fields of MuJoCo.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError(f"hardware has no {field!r} of MuJoCo")
+
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """See `elastic_env.runtime.physics.Simulation`."""
+        return tuple(self.bind(field) for field in fields)
+
+    def vary(self, field: str) -> Array:
+        """Hardware cannot be varied.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError(f"{field!r} of hardware cannot be varied")
+
+    def _opened(self) -> SupervisedBus:
+        settings = self.settings
+        if self._bus is None:
+            self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
+            if settings.imu_port is not None:
+                self._imu = AttitudeStream(settings.imu_port, settings.imu_baudrate, settings.imu_oldest_s)
+            prefer_realtime(Priority.LOOP)
+        return self._bus
+
+    @contextmanager
+    def _or_closed(self) -> Iterator[None]:
+        """Torque off and ports closed where what is done within does not succeed."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+    def _agree(self, angle: float) -> None:
+        """Ask once before the first motion."""
+        if self._is_agreed:
+            return
+        limits = self.settings.limits
+        question = (
+            f"The servo at {self.settings.port} will move to {angle:.3f} rad, then anywhere between its limits, "
+            f"{limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of {self._pendulum_nm:.1f} N·m. Is "
+            "its way free, and the power switch in reach? Type the whole word yes: "
+        )
+        if not sys.stdin.isatty():
+            raise HardwareError(
+                f"nobody is at the terminal to agree to a motion at {self.settings.port}; if the way is free, say so "
+                "by --yes, in Python by confirm=False"
+            )
+        try:
+            answer = input(question)
+        except EOFError:
+            answer = ""
+        if answer.strip().lower() != "yes":
+            raise HardwareError(f"nobody agreed to the motion at {self.settings.port}; nothing has moved")
+        self._is_agreed = True
+
+    def _move(self, start: float, end: float) -> None:
+        duration = max(QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S)
+        steps = int(np.ceil(duration / self._period_s))
+        for share in minimum_jerk(np.arange(1, steps + 1) / steps):
+            self._cycle(start + (end - start) * float(share))
+
+    def _cycles(self, angle: float, duration_s: float) -> None:
+        for _ in range(round(duration_s / self._period_s)):
+            self._cycle(angle)
+
+    def _servo_goal(self, angle: float) -> Array:
+        return np.array([self.settings.servo_angle(angle)])
+
+    def _restart_clock(self) -> None:
+        self._pace.restart()
+        self._read_s = time.monotonic()
+
+    def _cycle(self, angle: float) -> None:
+        """One control period; where the reply is missing the command is held and the cycle repeated."""
+        bus, missed, limited, overruns = self._opened(), 0, False, 0
+        while True:
+            due_s = self._pace.next()
+            cycle = bus.exchange(self._servo_goal(angle), due_s)
+            limited |= bool(cycle.is_limited.any()) and not cycle.is_held
+            late_s = self._pace.late(due_s + cycle.late_s)
+            overruns += self._pace.is_overrun(late_s)
+            if cycle.states.is_fresh.all():
+                break
+            missed += 1
+        self._take(cycle)
+        last = self.timing
+        self.timing = Timing(
+            jitter_s=late_s,
+            period_s=cycle.states.time_s - self._read_s,
+            overruns=last.overruns + overruns,
+            missed_replies=last.missed_replies + missed,
+            limited=last.limited + limited,
+        )
+        self._read_s = cycle.states.time_s
+
+    def _take(self, cycle: Cycle) -> None:
+        settings, at = self.settings, self._at
+        self._goal = settings.joint_angle(float(cycle.goals[0]))
+        self.qpos[0, at.theta[0]] = settings.joint_angle(float(cycle.states.position[0]))
+        self.qvel[0, at.theta_dot[0]] = settings.direction * float(cycle.states.velocity[0])
+        self.motor_torque[0] = settings.direction * float(torque_of_current(cycle.states.current[0]))
+        if self._imu is not None:
+            sample = self._imu.latest()
+            q = link_angle(sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            self._require_together(q, cycle.states.time_s - sample.time_s)
+            self.qpos[0, at.q[0]] = q
+
+    def _require_together(self, q: float, age_s: float) -> None:
+        """Refuse a link that is where no gear bends to; the motor has moved on since the IMU measured."""
+        settings, at = self.settings, self._at
+        apart = q - float(self.qpos[0, at.theta[0]])
+        if math.isfinite(apart):  # of others there is no remainder, and they are too far
+            apart = math.remainder(apart, 2.0 * math.pi)
+        moved = abs(float(self.qvel[0, at.theta_dot[0]])) * max(age_s, 0.0)
+        if exceeds(abs(apart), settings.largest_deflection_rad + moved):
+            raise HardwareError(
+                f"the link, by the IMU at {settings.imu_port}, is {apart:+.2f} rad from the servo's angle, more than "
+                f"largest_deflection_rad {settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
+                "imu_offset_rad of the mounting, or look what has come loose"
+            )

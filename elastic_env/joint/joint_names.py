@@ -1,0 +1,52 @@
+"""Names that an elastic joint gives to its parts, and where its angles stand in a compiled model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.signals import IntArray
+
+
+def motor_name(joint: str) -> str:
+    """Name of the rotor's hinge of an elastic joint."""
+    return f"{joint}_motor"
+
+
+def spring_name(joint: str) -> str:
+    """Name of the tendon of length θ − q."""
+    return f"{joint}_spring"
+
+
+def servo_name(joint: str) -> str:
+    """Name of the servo's actuator."""
+    return f"{joint}_servo"
+
+
+def link_name(joint: str) -> str:
+    """Name of the tendon whose length is q in the series form."""
+    return f"{joint}_link"
+
+
+@dataclass(frozen=True)
+class JointAddresses:
+    """Where motor and link angles of the elastic joints stand in `qpos` and `qvel`, each (n,)."""
+
+    theta: IntArray
+    q: IntArray
+    theta_dot: IntArray
+    q_dot: IntArray
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joints: Sequence[str]) -> "JointAddresses":
+        """Look the joints up by name, in a model of the tendon or the rigid form."""
+        link = [model.joint(name) for name in joints]
+        known = {model.joint(i).name for i in range(model.njnt)}
+        motor = [model.joint(motor_name(n)) if motor_name(n) in known else model.joint(n) for n in joints]
+        return cls(
+            theta=np.array([joint.qposadr[0] for joint in motor], dtype=np.int64),
+            q=np.array([joint.qposadr[0] for joint in link], dtype=np.int64),
+            theta_dot=np.array([joint.dofadr[0] for joint in motor], dtype=np.int64),
+            q_dot=np.array([joint.dofadr[0] for joint in link], dtype=np.int64),
+        )

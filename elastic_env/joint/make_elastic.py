@@ -1,0 +1,317 @@
+"""Turn rigid hinges of any MuJoCo specification into elastic joints.
+
+Three forms of the same joint:
+
+* `tendon` (default): the rotor is a hinge `<joint>_motor` of its own with armature B, and a fixed tendon
+  `<joint>_spring` of length θ − q couples it to the link's hinge: K, D, and backlash as the spring's dead band.
+  The link's hinge keeps its name, axis, limits and everything that refers to it.
+* `series`: two collinear hinges on the link's body, θ = `<joint>_motor` and q − θ = `<joint>`; the link angle is
+  the length of the tendon `<joint>_link`. Slower; kept for checking the tendon form.
+* `rigid`: no spring; the rotor's inertia is the hinge's armature.
+
+Friction acts on the link side of the spring, the servo and all actuators of the hinge on the rotor.
+"""
+
+import warnings
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.joint_names import link_name, motor_name, servo_name, spring_name
+from elastic_env.joint.keyframes import give_keyframes, take_keyframes
+from elastic_env.joint.time_step import is_stable, largest_stable_timestep
+
+Form = Literal["tendon", "series", "rigid"]
+ActuatorRule = Literal["keep", "replace"]
+
+_JOINT = mujoco.mjtTrn.mjTRN_JOINT
+_ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_ROTOR_MASS = 1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
+# MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
+_FRICTION_SOLREF = (0.001, 1.0)
+_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+
+
+def make_elastic(
+    spec: mujoco.MjSpec,
+    joints: Mapping[str, ElasticJoint],
+    form: Form = "tendon",
+    actuators: ActuatorRule = "keep",
+) -> mujoco.MjSpec:
+    """A copy of a specification in which the named hinges are elastic.
+
+    What a hinge had stays: limits, springs, damping and friction on the link (the joint's friction is added to it),
+    sensors and equalities on the link angle, actuators on the rotor. Its armature, which stands for the rotor, is
+    replaced by the rotor inertia. Keyframes get the rotors at their link angles, without deflection.
+
+    Args:
+        spec: Any specification with hinges; it is not changed.
+        joints: Parameters by hinge name.
+        form: "tendon", "series" or "rigid", see the module.
+        actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where there is none;
+            "replace" deletes them and adds the servo.
+
+    Returns:
+        The elastic specification, ready to compile.
+
+    Raises:
+        ConfigurationError: Unknown form or hinge, a joint that is no hinge, a name that is already taken, or
+            parameters that the series form cannot represent.
+
+    Warns:
+        UserWarning: The model's integrator and physics step do not follow the elastic joints, or a servo is left out
+            because the hinge keeps its actuators.
+    """
+    elastic = transformed(spec, joints, form, actuators)
+    _warn_of_explosion(elastic)
+    return elastic
+
+
+def transformed(
+    spec: mujoco.MjSpec, joints: Mapping[str, ElasticJoint], form: Form = "tendon", actuators: ActuatorRule = "keep"
+) -> mujoco.MjSpec:
+    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at their stability then."""
+    if form not in get_args(Form):
+        raise unknown_name("form", form, get_args(Form))
+    if actuators not in get_args(ActuatorRule):
+        raise unknown_name("actuator rule", actuators, get_args(ActuatorRule))
+    elastic = spec.copy()
+    keyframes = take_keyframes(elastic)
+    _resolve_springdampers(elastic, list(joints))
+    for name, joint in joints.items():
+        _transform(elastic, _hinge(elastic, name), joint, form, actuators)
+    give_keyframes(elastic, keyframes, list(joints))
+    return elastic
+
+
+def _warn_of_explosion(spec: mujoco.MjSpec) -> None:
+    """Say so where the model's integrator does not follow its elastic joints: MuJoCo would start it anew silently."""
+    model = spec.compile()
+    if is_stable(model):
+        return
+    own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    cure = f"take a physics step of at most {largest_stable_timestep(model) / 1.1:.2g} s with it"
+    if is_stable(model):
+        cure = "that follows them"
+    warnings.warn(
+        f"the elastic joints explode with the integrator {own} at a physics step of {model.opt.timestep:g} s, after "
+        "which MuJoCo starts a model anew without a word; set spec.option.integrator to "
+        f"mujoco.mjtIntegrator.mjINT_IMPLICITFAST, {cure}",
+        stacklevel=3,
+    )
+
+
+def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
+    """Write out springs that are given as time constants: they follow from inertias that the transform changes."""
+    given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
+    if given:
+        model = spec.compile()
+        for hinge in given:
+            compiled = model.joint(hinge.name)
+            hinge.stiffness = np.array([compiled.stiffness[0], 0.0, 0.0])
+            hinge.damping = np.array([compiled.damping[0], 0.0, 0.0])
+            hinge.springdamper = np.zeros(2)
+
+
+def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
+    hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
+    if name not in hinges:
+        raise unknown_name("hinge", name, hinges)
+    taken = {j.name for j in spec.joints} | {t.name for t in spec.tendons} | {a.name for a in spec.actuators}
+    taken |= {motor_name(name)} & {b.name for b in spec.bodies}
+    for derived in (motor_name(name), spring_name(name), servo_name(name), link_name(name)):
+        if derived in taken:
+            raise ConfigurationError(f"{derived!r} already exists in the model; is the hinge {name!r} elastic already?")
+    return spec.joint(name)
+
+
+def _transform(
+    spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint, form: Form, rule: ActuatorRule
+) -> None:
+    name = hinge.name
+    driven = name if form == "rigid" else motor_name(name)
+    if form == "tendon":
+        _add_rotor(hinge, joint, _rotor_body(spec, hinge))
+        _add_spring(spec, name, joint)
+        _add_friction(hinge, joint)
+        hinge.armature = 0.0
+    elif form == "series":
+        _split_hinge(spec, hinge, joint)
+    else:
+        _add_friction(hinge, joint)
+        hinge.armature = joint.rotor_inertia
+    _drive(spec, name, driven, joint.servo, rule)
+    _follow_actuators(spec, name, driven)
+
+
+def _rotor_body(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint) -> mujoco.MjsBody:
+    """A body for the rotor beside the link's. Where it is does not matter: it has no mass, only the armature."""
+    body = hinge.parent
+    parent = body.parent if isinstance(body.parent, mujoco.MjsBody) else spec.worldbody
+    # from a specification of its own, so that the model's defaults, units and bounds of mass do not apply to it
+    blank = mujoco.MjSpec()
+    blank.compiler.degree = hinge.compiler.degree
+    rotor = blank.worldbody.add_body(
+        name=motor_name(""), mass=_ROTOR_MASS, ipos=[0.0] * 3, inertia=[_ROTOR_MASS] * 3, explicitinertial=True
+    )
+    if spec.option.density > 0.0 or spec.option.viscosity > 0.0:
+        # without a geom, drag acts on the box of equal inertia, which for a massless rotor is as large as 2 m
+        rotor.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-9, 0.0, 0.0], mass=0.0, group=6, contype=0, conaffinity=0,
+            fluid_ellipsoid=1, fluid_coefs=[0.0] * 5,
+        )  # fmt: skip
+    return parent.add_frame().attach_body(rotor, hinge.name, "")
+
+
+def _add_rotor(hinge: mujoco.MjsJoint, joint: ElasticJoint, body: mujoco.MjsBody) -> mujoco.MjsJoint:
+    """The rotor's hinge. Every attribute is set: the model's default class must not leak into the rotor."""
+    limits = _in_radians(hinge, hinge.range)
+    rotor = body.add_joint(
+        name=motor_name(hinge.name),
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        pos=hinge.pos,
+        axis=hinge.axis,
+        ref=hinge.ref,
+        springref=hinge.ref,
+        armature=joint.rotor_inertia,
+        limited=mujoco.mjtLimited.mjLIMITED_FALSE,
+        range=limits,  # not enforced, so not converted either; for actuators that inherit their range
+        actfrclimited=hinge.actfrclimited,
+        actfrcrange=hinge.actfrcrange,
+        frictionloss=0.0,
+        group=hinge.group,
+    )
+    rotor.stiffness = rotor.damping = np.zeros(3)
+    rotor.springyield, rotor.actgravcomp = 0.0, False
+    ref = float(_in_radians(hinge, hinge.ref))  # of an attached model the unit may differ from the rotor's
+    rotor.ref = rotor.springref = np.rad2deg(ref) if rotor.compiler.degree else ref
+    rotor.springdamper = np.zeros(2)
+    hinge.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    hinge.actfrcrange = np.zeros(2)
+    return rotor
+
+
+def _in_radians(hinge: mujoco.MjsJoint, angle: Array) -> Array:
+    """An angle of the specification, which may be written in degrees, as the compiled model has it."""
+    return np.deg2rad(angle) if hinge.compiler.degree else np.array(angle)
+
+
+def _blank_tendon(spec: mujoco.MjSpec, name: str) -> mujoco.MjsTendon:
+    """A tendon without any spring, damper, friction or limit that a default class may hold."""
+    tendon = spec.add_tendon(name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE, frictionloss=0.0, armature=0.0)
+    tendon.stiffness = tendon.damping = np.zeros(3)
+    tendon.springlength = np.zeros(2)
+    tendon.springyield = 0.0
+    tendon.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    return tendon
+
+
+def _add_spring(spec: mujoco.MjSpec, name: str, joint: ElasticJoint) -> None:
+    spring = _blank_tendon(spec, spring_name(name))
+    spring.wrap_joint(motor_name(name), 1.0)
+    spring.wrap_joint(name, -1.0)
+    spring.stiffness = np.array([joint.stiffness, 0.0, 0.0])
+    spring.damping = np.array([joint.damping, 0.0, 0.0])
+    spring.springlength = np.array([-joint.backlash / 2, joint.backlash / 2])
+
+
+def _add_friction(element: mujoco.MjsJoint | mujoco.MjsTendon, joint: ElasticJoint) -> None:
+    """Friction on the link angle, on top of what the element has."""
+    element.damping = element.damping + np.array([joint.viscous_friction, 0.0, 0.0])
+    if joint.coulomb_friction > 0.0:
+        element.frictionloss += joint.coulomb_friction
+        element.solref_friction[:] = _FRICTION_SOLREF
+        element.solimp_friction[:] = _FRICTION_SOLIMP
+
+
+def _split_hinge(spec: mujoco.MjSpec, hinge: mujoco.MjsJoint, joint: ElasticJoint) -> None:
+    """Series form: a collinear hinge for θ; the old hinge becomes q − θ and carries the spring."""
+    body = hinge.parent
+    if body.joints[-1].name != hinge.name:
+        raise ConfigurationError(
+            f"the series form needs {hinge.name!r} to be the last joint of its body {body.name!r}, which ends with "
+            f"{body.joints[-1].name!r}; use the tendon form"
+        )
+    if joint.backlash > 0.0:
+        raise ConfigurationError(
+            f"the series form has a linear spring, but backlash of {hinge.name!r} is {joint.backlash} rad; "
+            "use the tendon form"
+        )
+    _add_rotor(hinge, joint, body)
+    link = _blank_tendon(spec, link_name(hinge.name))
+    link.wrap_joint(motor_name(hinge.name), 1.0)
+    link.wrap_joint(hinge.name, 1.0)
+    link.limited, link.range = hinge.limited, _in_radians(hinge, hinge.range)
+    link.stiffness, link.damping = np.array(hinge.stiffness), np.array(hinge.damping)
+    link.springlength = _in_radians(hinge, np.full(2, hinge.springref))
+    link.frictionloss = hinge.frictionloss
+    _add_friction(link, joint)
+    hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_FALSE, np.zeros(2)
+    hinge.frictionloss, hinge.armature, hinge.ref, hinge.springref = 0.0, 0.0, 0.0, 0.0
+    hinge.stiffness = np.array([joint.stiffness, 0.0, 0.0])
+    hinge.damping = np.array([joint.damping, 0.0, 0.0])
+
+
+def _drive(spec: mujoco.MjSpec, name: str, driven: str, servo: Servo | None, rule: ActuatorRule) -> None:
+    """Put the hinge's actuators, or the servo, on the driven joint."""
+    existing = [a for a in spec.actuators if a.trntype in _ON_JOINT and a.target == name]
+    for actuator in existing:
+        if rule == "replace":
+            _redirect_sensors(spec, actuator.name, name, servo)
+            spec.delete(actuator)
+        else:
+            actuator.target = driven
+    if servo is not None and (rule == "replace" or not existing):
+        _add_servo(spec, servo_name(name), driven, servo)
+    elif servo is not None:
+        kept = ", ".join(repr(actuator.name) for actuator in existing)
+        warnings.warn(
+            f"the hinge {name!r} keeps its actuator {kept}, so that its servo is left out; choose actuators='replace' "
+            "for the servo in its place, or give the joint servo=None",
+            stacklevel=4,
+        )
+
+
+def _follow_actuators(spec: mujoco.MjSpec, name: str, driven: str) -> None:
+    """Sensors of the actuator torque on a hinge go where its actuators go."""
+    for sensor in spec.sensors:
+        if sensor.type == mujoco.mjtSensor.mjSENS_JOINTACTFRC and sensor.objname == name:
+            sensor.objname = driven
+
+
+def _redirect_sensors(spec: mujoco.MjSpec, actuator: str, joint: str, servo: Servo | None) -> None:
+    """Sensors of an actuator that is replaced read the servo instead."""
+    sensors = [s for s in spec.sensors if s.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR and s.objname == actuator]
+    if sensors and servo is None:
+        raise ConfigurationError(
+            f"sensor {sensors[0].name!r} reads the actuator {actuator!r}, which is to be replaced; give the joint "
+            f"{joint!r} a servo, or delete the sensor"
+        )
+    for sensor in sensors:
+        sensor.objname = servo_name(joint)
+
+
+def _add_servo(spec: mujoco.MjSpec, name: str, target: str, servo: Servo) -> None:
+    actuator = spec.add_actuator(name=name, target=target, trntype=_JOINT)
+    actuator.damping, actuator.armature = np.zeros(3), 0.0
+    actuator.delay, actuator.nsample = 0.0, 0
+    actuator.actlimited, actuator.actrange = mujoco.mjtLimited.mjLIMITED_FALSE, np.zeros(2)
+    actuator.actearly, actuator.inheritrange = False, 0.0
+    actuator.ctrlrange, actuator.cranklength = np.zeros(2), 0.0
+    actuator.set_to_pid(
+        kp=servo.position_gain,
+        kv=servo.velocity_gain,
+        ki=servo.integral_gain,
+        imax=servo.integral_limit,
+        ctrlspec=int(mujoco.mjtCtrlInput.mjINPUT_POS),
+    )
+    actuator.gear = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    actuator.forcerange = np.array([-servo.torque_limit, servo.torque_limit])

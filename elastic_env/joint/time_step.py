@@ -1,0 +1,118 @@
+r"""Whether MuJoCo's integrator follows the springs, dampers and servos of a model, or lets them explode.
+
+Near rest a step of the physics is linear, :math:`x_{k+1} = A x_k`, and stable if no eigenvalue of A lies outside the
+unit circle. Of a semi-implicit step (Euler, implicitfast) that means ωh < 2 for a spring without damper whose
+frequency is ω, of RK4 ωh < 2.83. A comes from differences of MuJoCo's own step, so that every integrator, every
+inertia and every servo is seen as it is. Left out are contacts, limits, dry friction and dead bands, which only hold
+a joint back.
+"""
+
+import copy
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+
+_ROOM = 1.1
+"""By how much a physics step must be below the limit in the reference posture: inertias change with the posture."""
+_LARGEST_RADIUS = 1.0 + 1e-3
+"""Largest eigenvalue that counts as stable; those of a free body are 1, up to the error of the differences."""
+_DIFFERENCE = 1e-6
+_HALVINGS = 24
+_LEFT_OUT = [int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}")) for what in ("CONTACT", "LIMIT", "GRAVITY")]
+
+
+def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> float:
+    """Largest magnitude of the eigenvalues of a physics step about the model's reference posture [1].
+
+    Args:
+        model: It is not changed.
+        timestep_s: Physics step in place of the model's own [s].
+
+    Returns:
+        At most 1 for a stable step; infinite where a step gives no number.
+    """
+    linear = _without_constraints(model)
+    if timestep_s is not None:
+        linear.opt.timestep = timestep_s
+    A = _transition(linear)
+    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0)) if np.isfinite(A).all() else float("inf")
+
+
+def largest_stable_timestep(model: mujoco.MjModel) -> float:
+    """The largest physics step, from a little above the model's own downwards, that is stable, to a thousandth [s].
+
+    Raises:
+        ConfigurationError: None is, down to a millionth of it.
+    """
+    high, low = _ROOM * model.opt.timestep, 0.0
+    if spectral_radius(model, high) <= _LARGEST_RADIUS:
+        return high
+    for _ in range(_HALVINGS):
+        middle = (high + low) / 2.0
+        if spectral_radius(model, middle) <= _LARGEST_RADIUS:
+            low = middle
+        else:
+            high = middle
+        if low > 0.0 and high - low < 1e-3 * low:
+            return low
+    raise ConfigurationError(
+        f"no physics step from {model.opt.timestep:g} s down to {high:g} s follows the joints of this model: give them "
+        "more rotor inertia, their links more inertia, or less stiffness"
+    )
+
+
+def is_stable(model: mujoco.MjModel) -> bool:
+    """Whether the model's physics step is stable, with a tenth of room."""
+    return spectral_radius(model, _ROOM * model.opt.timestep) <= _LARGEST_RADIUS
+
+
+def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
+    """Refuse a model whose joints explode with its physics step.
+
+    Args:
+        model: With the physics step that it is to be played with.
+        control_period_s: Which the physics step has to divide [s].
+
+    Raises:
+        ConfigurationError: With the largest stable physics step.
+    """
+    if is_stable(model):
+        return
+    parts = int(np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9))
+    raise ConfigurationError(
+        f"the joints are too stiff, or their links or rotors too light, for timestep_s = {model.opt.timestep:g} s: the "
+        f"simulation would explode; the largest stable one is timestep_s = {control_period_s / parts:.12g} s"
+    )
+
+
+def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model with nothing that holds a joint back."""
+    linear = copy.copy(model)
+    linear.opt.disableflags |= sum(_LEFT_OUT)
+    linear.dof_frictionloss[:] = 0.0
+    linear.tendon_frictionloss[:] = 0.0
+    linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
+    return linear
+
+
+def _transition(model: mujoco.MjModel) -> Array:
+    """A by central differences: MuJoCo's own do not take RK4."""
+    size = 2 * model.nv + model.na
+    data, A = mujoco.MjData(model), np.empty((size, size))
+    rest = data.qpos.copy()
+
+    def stepped(change: Array) -> Array:
+        mujoco.mj_resetData(model, data)
+        dq, data.qvel[:], data.act[:] = np.split(change, [model.nv, 2 * model.nv])
+        mujoco.mj_integratePos(model, data.qpos, dq, 1.0)
+        mujoco.mj_step(model, data)
+        moved = np.empty(model.nv)
+        mujoco.mj_differentiatePos(model, moved, 1.0, rest, data.qpos)
+        return np.concatenate([moved, data.qvel, data.act])
+
+    for column, change in enumerate(_DIFFERENCE * np.eye(size)):
+        A[:, column] = (stepped(change) - stepped(-change)) / (2.0 * _DIFFERENCE)
+    return A

@@ -1,0 +1,217 @@
+"""Timing of a walk in place: step periods, phases, and the ZMP reference that goes with them.
+
+A step is double, single, double support; its support foot is fixed and the other one swings. The first step swings the
+right foot, as Fig. 1 of the paper. Before and after the walk the robot stands.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from elastic_env.core.config import Model, plain_numbers, quantity
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.motion.trajectory import STAND_S, control_times, minimum_jerk
+
+LEFT, RIGHT = 0, 1
+"""Index of a foot or leg."""
+
+STEP_DURATIONS = {24.0: (7.0, 10.0, 7.0), 3.0: (1.1, 0.8, 1.1), 1.6: (0.5, 0.6, 0.5), 1.1: (0.3, 0.5, 0.3)}
+"""Durations of double, single, double support by step period [s]; 24 s and 3 s are the paper's."""
+
+TRANSITION_S = 0.2
+"""Half-width of the time around a lift-off or touch-down that counts as transition [s]."""
+
+LONGEST_WALK_S = 600.0
+"""Longest walk that is planned, with standing [s]: its tables hold every control step."""
+
+_RAMP_SHIFT_S = 0.1
+_RAMP_INWARD_M = 0.02
+
+
+class Gait(Model):
+    """A walk in place."""
+
+    double_support_s: float = quantity("s", 1.1, gt=0, le=3600, description="first double support of a step")
+    single_support_s: float = quantity("s", 0.8, gt=0, le=3600, description="single support of a step")
+    last_double_support_s: float = quantity("s", 1.1, gt=0, le=3600, description="last double support of a step")
+    num_steps: int = quantity("1", 4, ge=1, le=1000, description="number of steps")
+    lift_m: float = quantity("m", 0.025, gt=0, description="height to which the swing foot is lifted")
+    hip_height_m: float = quantity("m", 0.66, gt=0, description="height of the hip axes over the ground")
+    transfer: Literal["smooth", "ramp"] = "smooth"
+    """How the ZMP goes from foot to foot: over the whole double support, or within 0.1 s before lift-off and after
+    touch-down, 0.02 m inward of the ankle, as in the published controller of this robot's group."""
+
+    @property
+    def step_period_s(self) -> float:
+        """Duration of a step [s]."""
+        return self.double_support_s + self.single_support_s + self.last_double_support_s
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the episode: the walk, and standing before and after it [s]."""
+        return self.num_steps * self.step_period_s + 2.0 * STAND_S
+
+    @model_validator(mode="after")
+    def _ramp_fits(self) -> Self:
+        shortest = min(self.double_support_s, self.last_double_support_s)
+        if self.transfer == "ramp" and shortest < _RAMP_SHIFT_S:
+            raise ValueError(
+                f"the transfer 'ramp' shifts the ZMP in {_RAMP_SHIFT_S} s; a double support of {shortest} s is shorter"
+            )
+        return self
+
+
+def make_gait(step_period: "float | tuple[float, float, float] | list[float] | Gait", **parameters: Any) -> Gait:
+    """A gait by its step period, or by the durations of double, single, double support [s].
+
+    Args:
+        step_period: 24, 3, 1.6 or 1.1 [s], or three durations [s], or a gait, which is returned.
+        **parameters: Further parameters of `Gait`.
+
+    Raises:
+        ConfigurationError: The period has no name, or the durations are not three.
+    """
+    if isinstance(step_period, Gait):
+        return step_period.replace(**parameters) if parameters else step_period
+    period, durations = plain_numbers(step_period), ()
+    if isinstance(period, tuple | list):
+        durations = tuple(period)
+    elif isinstance(period, int | float):
+        durations = STEP_DURATIONS.get(period, ())
+    if len(durations) != 3:
+        known = ", ".join(f"{period:g}" for period in STEP_DURATIONS)
+        raise ConfigurationError(
+            f"step_period must be one of {known} [s], or the three durations of double, single and double support [s] "
+            f"such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
+        )
+    names = ("double_support_s", "single_support_s", "last_double_support_s")
+    return Gait(**dict(zip(names, durations, strict=True)), **parameters)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Phases of a walk at the ends of the control periods, (T,) each.
+
+    Attributes:
+        time: Time from the start of the episode [s].
+        support: Support foot of the step, `LEFT` or `RIGHT`; before and after the walk that of the next or last step.
+        single: Whether the other foot is off the ground.
+        swing: Progress of the swing, 0 to 1; 0 and 1 before and after it.
+        transition: Within `TRANSITION_S` of a lift-off or touch-down.
+        walking: Whether it belongs to the walk, which is what is scored.
+    """
+
+    time: Array
+    support: IntArray
+    single: BoolArray
+    swing: Array
+    transition: BoolArray
+    walking: BoolArray
+
+
+def step_timing(gait: Gait, control_period_s: float) -> Timing:
+    """Phases of a gait.
+
+    Raises:
+        ConfigurationError: A duration is no multiple of the control period, or the walk is too long.
+    """
+    names = ("double_support_s", "single_support_s", "last_double_support_s")
+    first, single, _ = (_whole_steps(name, getattr(gait, name), control_period_s) for name in names)
+    period = sum(_whole_steps(name, getattr(gait, name), control_period_s) for name in names)
+    _require_short(gait)
+    time = control_times(gait.duration_s, control_period_s)
+    begin = round(STAND_S / control_period_s)
+    since = np.arange(len(time)) - begin  # control steps since the walk began
+    of_walk = np.clip((since - 1) // period, 0, gait.num_steps - 1)
+    within = since - of_walk * period - first  # control steps since lift-off
+    swing = np.clip(within / single, 0.0, 1.0)
+    lift_offs = np.arange(gait.num_steps) * period + first
+    events = np.concatenate([lift_offs, lift_offs + single])
+    nearest = _distance(since, np.sort(events))
+    walking = (since > 0) & (since <= gait.num_steps * period)
+    return Timing(
+        time=time,
+        support=of_walk % 2,
+        single=(within > 0) & (within < single),
+        swing=swing,
+        transition=walking & (nearest * control_period_s <= TRANSITION_S + 1e-9),
+        walking=walking,
+    )
+
+
+def _distance(steps: IntArray, events: IntArray) -> IntArray:
+    """Control steps from each step to the nearest of some events in order, (T,)."""
+    after = np.searchsorted(events, steps)
+    last = len(events) - 1
+    return np.minimum(np.abs(steps - events[np.minimum(after, last)]), np.abs(steps - events[np.maximum(after - 1, 0)]))
+
+
+def zmp_reference(gait: Gait, timing: Timing, feet: Array) -> Array:
+    """Reference of the zero moment point.
+
+    Args:
+        gait: Durations and kind of transfer.
+        timing: Phases at the control times.
+        feet: Middle of the left and the right sole, (2, 2) [m].
+
+    Returns:
+        (T, 2) [m]; under the support foot in single support, halfway between the feet before and after the walk.
+    """
+    middle, supports = feet.mean(axis=0), support_points(gait, feet)
+    zmp = np.repeat(middle[None], len(timing.time), axis=0)
+    for begin, duration, start, target in _shifts(gait, supports, middle):
+        progress = (timing.time - begin) / duration
+        blend = minimum_jerk(progress) if gait.transfer == "smooth" else np.clip(progress, 0.0, 1.0)
+        zmp += blend[:, None] * (target - start)
+    return zmp
+
+
+def support_points(gait: Gait, feet: Array) -> Array:
+    """Where the ZMP is while a foot alone carries the robot, under or inward of its ankle, (2, 2) [m]."""
+    inward = 0.0 if gait.transfer == "smooth" else _RAMP_INWARD_M
+    towards = feet.mean(axis=0) - feet
+    return feet + inward * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+
+
+def _shifts(gait: Gait, supports: Array, middle: Array) -> list[tuple[float, float, Array, Array]]:
+    """Moves of the ZMP: begin [s], duration [s], from and to [m]."""
+    shifts, last, begin = [], middle, STAND_S
+    for step in range(gait.num_steps):
+        lift_off = begin + gait.double_support_s
+        touch_down = lift_off + gait.single_support_s
+        end = begin + gait.step_period_s
+        support = supports[step % 2]
+        if gait.transfer == "ramp":
+            shifts += [
+                (lift_off - _RAMP_SHIFT_S, _RAMP_SHIFT_S, middle, support),
+                (touch_down, _RAMP_SHIFT_S, support, middle),
+            ]
+        else:
+            left = begin if step == 0 else begin - gait.last_double_support_s
+            shifts.append((left, lift_off - left, last, support))
+            if step == gait.num_steps - 1:
+                shifts.append((touch_down, end - touch_down, support, middle))
+        last, begin = support, end
+    return shifts
+
+
+def _require_short(gait: Gait) -> None:
+    if gait.duration_s > LONGEST_WALK_S:
+        raise ConfigurationError(
+            f"a walk must last at most {LONGEST_WALK_S:g} s with standing, {gait.num_steps} steps of "
+            f"{gait.step_period_s:g} s last {gait.duration_s:g} s; take fewer steps or shorter ones"
+        )
+
+
+def _whole_steps(name: str, duration_s: float, control_period_s: float) -> int:
+    steps = duration_s / control_period_s
+    if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+        nearest = sorted({max(int(bound), 1) * control_period_s for bound in (np.floor(steps), np.ceil(steps))})
+        raise ConfigurationError(
+            f"{name} must be a multiple of the control period of {control_period_s} s, got {duration_s} s; "
+            f"the nearest {'is' if len(nearest) == 1 else 'are'} {' and '.join(f'{bound:.10g} s' for bound in nearest)}"
+        )
+    return round(steps)

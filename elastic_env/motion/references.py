@@ -1,0 +1,327 @@
+"""Reference trajectories of the testbed: static positions, sine, multisine, steps.
+
+A reference is a validated model; `plan` turns it into samples at the control rate, with rate and acceleration in closed
+form. Every plan begins with a second of standing, in which policies ramp in, and moves by quintic (minimum-jerk)
+polynomials, which start and end without acceleration.
+"""
+
+from typing import Annotated, Any, Literal, Self, TypeAlias
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from elastic_env.core.config import LARGEST_SEED, Model, quantity
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array, IntArray
+from elastic_env.motion.trajectory import (
+    QUINTIC_PEAK_ACCELERATION,
+    QUINTIC_PEAK_RATE,
+    STAND_S,
+    Extent,
+    Plan,
+    control_times,
+    quintic,
+    quintic_moves,
+)
+
+_LONGEST_S, _LONGEST_SUM_S = 7200.0, 36_000.0
+
+
+def _require_short(duration_s: float) -> None:
+    """Refuse a motion that lasts at least as long [s]: its tables hold every control step.
+
+    Raises:
+        ValueError: It is too long.
+    """
+    if duration_s > _LONGEST_S:
+        raise ValueError(
+            f"a motion must last at most {_LONGEST_S:g} s, got {duration_s:.0f} s or more; take fewer or quicker moves"
+        )
+
+
+class Hold(Model):
+    """The paper's static positions, evenly spaced in gravity torque, approached from below and then from above.
+
+    Without compensation the link sags below its reference; the references lie so far beyond the positions that the
+    uncompensated link rests at evenly spaced torques.
+
+    The sweep starts below the first position and turns round beyond the last, so that every position is reached from
+    both sides. Moves are slow: a link that overshoots would lose the friction's hysteresis, which the experiment shows.
+    """
+
+    kind: Literal["hold"] = "hold"
+    positions: int = quantity("1", 20, ge=2, le=1000, description="number of static positions")
+    lower: float = quantity(
+        "1", -0.875, gt=-1, lt=1, description="first position, share of the torque at the horizontal"
+    )
+    upper: float = quantity("1", 34.6 / 60, gt=-1, lt=1, description="last position, likewise")
+    rate: float = quantity("rad/s", 0.06, gt=0, description="peak rate of the moves")
+    sag: float = quantity("rad", 60 / 1001, ge=0, description="deflection at the horizontal without compensation")
+    shortest_move_s: float = quantity("s", 4.0, gt=0, le=3600, description="shortest move; quick ones ring")
+    settle_s: float = quantity("s", 1.5, ge=0, le=3600, description="time at rest before the measurement")
+    measure_s: float = quantity("s", 0.5, gt=0, le=3600, description="time of the measurement")
+    overrun: float = quantity("rad", 0.08, gt=0, description="how far the sweep starts and turns outside the positions")
+
+    @model_validator(mode="after")
+    def _range_is_ordered(self) -> Self:
+        if self.upper <= self.lower:
+            raise ValueError(f"upper must exceed lower, got lower {self.lower} and upper {self.upper}")
+        return self
+
+    @model_validator(mode="after")
+    def _ends_in_time(self) -> Self:
+        angles = self.angles
+        way = 2.0 * float(angles[-1] - angles[0]) + 3.0 * self.overrun
+        moves = max(QUINTIC_PEAK_RATE * way / self.rate, (2 * self.positions + 1) * self.shortest_move_s)
+        _require_short(STAND_S + moves + 2 * self.positions * (self.settle_s + self.measure_s))
+        return self
+
+    @property
+    def angles(self) -> Array:
+        """References of the static positions, (positions,) [rad], for τ_g proportional to sin q."""
+        shares = np.linspace(self.lower, self.upper, self.positions)
+        return np.arcsin(shares) + self.sag * shares
+
+    @property
+    def visits(self) -> tuple[Array, IntArray]:
+        """Angle [rad] and direction of approach (+1 from below, -1 from above) of each window at rest."""
+        angles = self.angles
+        directions = np.repeat(np.array([1, -1]), len(angles))
+        return np.concatenate([angles, angles[::-1]]), directions
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return False
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        angles = self.angles
+        distances = np.append(np.diff(angles), self.overrun)
+        durations = np.array([self._move_s(distance) for distance in distances])
+        return Extent(
+            float(angles[0]) - self.overrun,
+            float(angles[-1]) + self.overrun,
+            q_dot=QUINTIC_PEAK_RATE * float((distances / durations).max()),
+            q_ddot=QUINTIC_PEAK_ACCELERATION * float((distances / durations**2).max()),
+        )
+
+    def _move_s(self, distance: float) -> float:
+        """Duration of a move over a distance [rad]."""
+        return max(QUINTIC_PEAK_RATE * distance / self.rate, self.shortest_move_s)
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
+        """The plan, the same for every generator."""
+        angles, directions = self.visits
+        start, turn = angles[0] - self.overrun, self.angles[-1] + self.overrun
+        moves, windows = [], []
+        now, position = STAND_S, start
+
+        def move(target: float) -> None:
+            nonlocal now, position
+            duration = self._move_s(abs(target - position))
+            moves.append((now, duration, target))
+            now, position = now + duration, target
+
+        for visit, (angle, direction) in enumerate(zip(angles, directions, strict=True)):
+            if visit > 0 and direction != directions[visit - 1]:
+                move(turn)
+            move(angle)
+            windows.append((now + self.settle_s, now + self.settle_s + self.measure_s))
+            now = windows[-1][1]
+        t = control_times(now, control_period_s)
+        q, q_dot, q_ddot = quintic_moves(t, start, moves)
+        rest = np.full(len(t), -1)
+        for visit, (begin, end) in enumerate(windows):
+            rest[(t > begin) & (t <= end + 1e-9)] = visit
+        return Plan(q, q_dot, q_ddot, rest >= 0, rest)
+
+
+class _Oscillation(Model):
+    """What sine and multisine share: amplitude, an envelope that starts smoothly, a duration."""
+
+    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
+    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="angle about which it oscillates")
+    duration_s: float = quantity("s", 12.0, gt=0, le=3600, description="scored time")
+    onset_s: float = quantity("s", 2.0, gt=0, le=3600, description="time in which the amplitude grows; not scored")
+
+    def _enveloped(self, t: Array, x: Array, x_dot: Array, x_ddot: Array) -> Plan:
+        w, w_dot, w_ddot = quintic((t - STAND_S) / self.onset_s)
+        w_dot, w_ddot = w_dot / self.onset_s, w_ddot / self.onset_s**2
+        return Plan(
+            q=self.middle + w * x,
+            q_dot=w_dot * x + w * x_dot,
+            q_ddot=w_ddot * x + 2.0 * w_dot * x_dot + w * x_ddot,
+            scored=t > STAND_S + self.onset_s,
+            rest=np.full(len(t), -1),
+        )
+
+    def _extent(self, rate: float, acceleration: float) -> Extent:
+        """Bounds with the envelope, whatever the phase of the oscillation when it grows."""
+        w, w_dot, w_ddot = quintic(np.linspace(0.0, 1.0, 1001))
+        w_dot, w_ddot = w_dot / self.onset_s, np.abs(w_ddot) / self.onset_s**2
+        return Extent(
+            self.middle - self.amplitude,
+            self.middle + self.amplitude,
+            q_dot=float((w_dot * self.amplitude + w * rate).max()),
+            q_ddot=float((w_ddot * self.amplitude + 2.0 * w_dot * rate + w * acceleration).max()),
+        )
+
+    def _time_base(self, control_period_s: float) -> Array:
+        return control_times(STAND_S + self.onset_s + self.duration_s, control_period_s)
+
+
+class Sine(_Oscillation):
+    """One sine, the same in every episode."""
+
+    kind: Literal["sine"] = "sine"
+    frequency_hz: float = quantity("Hz", 0.25, gt=0, description="frequency")
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return False
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        omega = 2.0 * np.pi * self.frequency_hz
+        return self._extent(self.amplitude * omega, self.amplitude * omega**2)
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  one plan for all
+        """The plan, the same for every generator."""
+        t = self._time_base(control_period_s)
+        omega = 2.0 * np.pi * self.frequency_hz
+        phase = omega * (t - STAND_S)
+        x = self.amplitude * np.sin(phase)
+        return self._enveloped(t, x, self.amplitude * omega * np.cos(phase), -(omega**2) * x)
+
+
+class Multisine(_Oscillation):
+    """Sines of evenly spaced frequencies and equal amplitude, with phases drawn per episode; their sum stays inside."""
+
+    kind: Literal["multisine"] = "multisine"
+    amplitude: float = quantity("rad", 0.4, gt=0, lt=np.pi, description="largest angle from the middle")
+    lowest_hz: float = quantity("Hz", 0.1, gt=0, description="lowest frequency")
+    highest_hz: float = quantity("Hz", 1.0, gt=0, description="highest frequency")
+    components: int = quantity("1", 5, ge=2, le=100, description="number of sines")
+    seed: int | None = quantity(
+        "1", None, ge=0, le=LARGEST_SEED, description="seed of the phases; None draws new ones per episode"
+    )
+
+    @model_validator(mode="after")
+    def _frequencies_are_ordered(self) -> Self:
+        if self.highest_hz <= self.lowest_hz:
+            raise ValueError(f"highest_hz must exceed lowest_hz, got {self.lowest_hz} to {self.highest_hz} Hz")
+        return self
+
+    @model_validator(mode="after")
+    def _is_summed_in_time(self) -> Self:
+        if self.components * self.duration_s > _LONGEST_SUM_S:
+            raise ValueError(
+                f"components x duration_s must be at most {_LONGEST_SUM_S:g} s, got {self.components} x "
+                f"{self.duration_s:g} s; take fewer sines or less time"
+            )
+        return self
+
+    @property
+    def _omega(self) -> Array:
+        return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return self.seed is None
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        share = self.amplitude / self.components
+        return self._extent(share * float(self._omega.sum()), share * float((self._omega**2).sum()))
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan with phases of the generator, or of the reference's own seed."""
+        phases = _own(generator, self.seed).uniform(0.0, 2.0 * np.pi, self.components)
+        t = self._time_base(control_period_s)
+        omega, share = self._omega, self.amplitude / self.components
+        angle = omega * (t[:, None] - STAND_S) + phases
+        x = share * np.sin(angle).sum(axis=1)
+        x_dot = share * (omega * np.cos(angle)).sum(axis=1)
+        x_ddot = -share * (omega**2 * np.sin(angle)).sum(axis=1)
+        return self._enveloped(t, x, x_dot, x_ddot)
+
+
+class Steps(Model):
+    """Quick moves between random levels, each followed by a rest."""
+
+    kind: Literal["steps"] = "steps"
+    amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
+    middle: float = quantity("rad", 0.0, gt=-np.pi, lt=np.pi, description="middle of the levels")
+    move_s: float = quantity("s", 1.0, gt=0, le=3600, description="duration of a move")
+    rest_s: float = quantity("s", 1.0, ge=0, le=3600, description="rest after a move")
+    moves: int = quantity("1", 5, ge=1, le=1000, description="number of moves")
+    seed: int | None = quantity(
+        "1", None, ge=0, le=LARGEST_SEED, description="seed of the levels; None draws new ones per episode"
+    )
+
+    @model_validator(mode="after")
+    def _ends_in_time(self) -> Self:
+        _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
+        return self
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return self.seed is None
+
+    def extent(self) -> Extent:
+        """See `Extent`."""
+        span = 2.0 * self.amplitude
+        return Extent(
+            self.middle - self.amplitude,
+            self.middle + self.amplitude,
+            q_dot=QUINTIC_PEAK_RATE * span / self.move_s,
+            q_ddot=QUINTIC_PEAK_ACCELERATION * span / self.move_s**2,
+        )
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan with levels of the generator, or of the reference's own seed."""
+        offsets = _own(generator, self.seed).uniform(-self.amplitude, self.amplitude, self.moves)
+        period = self.move_s + self.rest_s
+        moves = [(STAND_S + i * period, self.move_s, float(self.middle + x)) for i, x in enumerate(offsets)]
+        t = control_times(STAND_S + self.moves * period, control_period_s)
+        q, q_dot, q_ddot = quintic_moves(t, self.middle, moves)
+        return Plan(q, q_dot, q_ddot, scored=t > STAND_S, rest=np.full(len(t), -1))
+
+
+AnyReference: TypeAlias = Hold | Sine | Multisine | Steps
+Reference = Annotated[AnyReference, Field(discriminator="kind")]
+
+REFERENCES: dict[str, type[AnyReference]] = {
+    "hold": Hold,
+    "sine": Sine,
+    "multisine": Multisine,
+    "steps": Steps,
+}
+
+
+def make_reference(
+    reference: "str | dict[str, Any] | AnyReference",
+) -> AnyReference:
+    """A reference from its name, from a mapping with `kind` and parameters, or as it is.
+
+    Raises:
+        ConfigurationError: The kind does not exist, or a parameter does not fit it.
+    """
+    if isinstance(reference, AnyReference):
+        return reference
+    if isinstance(reference, str):
+        reference = {"kind": reference}
+    if not isinstance(reference, dict):
+        raise ConfigurationError(f"a reference is a name, a mapping or a model, got {type(reference).__name__}")
+    kind = reference.get("kind")
+    if not isinstance(kind, str) or kind not in REFERENCES:
+        raise unknown_name("reference", kind, REFERENCES)
+    return REFERENCES[str(kind)](**reference)
+
+
+def _own(generator: np.random.Generator, seed: int | None) -> np.random.Generator:
+    return generator if seed is None else np.random.default_rng(seed)

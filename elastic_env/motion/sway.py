@@ -1,0 +1,67 @@
+r"""How a robot sways on its springs: natural frequencies of standing on both feet with the motors held.
+
+With both soles fixed, the pelvis pose x (position and small rotation, 6) determines the joint angles q(x). About the
+equilibrium, with the motors at θ = q + K⁻¹τ,
+
+.. math:: M(x)\,\ddot x = -\partial V / \partial x, \quad V = \tfrac12 \sum K (\theta - q(x))^2 + m g z_{com}(x)
+"""
+
+import numpy as np
+from scipy import linalg
+
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.biped import Biped
+from elastic_env.dynamics.leg_chains import LegLoads
+from elastic_env.dynamics.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
+from elastic_env.dynamics.rigid_body import FloatingBody
+
+_DOF = 6
+_STEP = 1e-4  # of the finite differences [m], [rad]
+
+
+def sway_frequencies(biped: Biped, pelvis: Array, stiffness: Array) -> Array:
+    """Natural frequencies of the robot standing with level pelvis, its weight shared equally.
+
+    Args:
+        biped: The robot.
+        pelvis: Position of the pelvis over the middle between the soles, (3,) [m].
+        stiffness: K of the twelve joints, (12,) [N·m/rad].
+
+    Returns:
+        The six angular frequencies, ascending, (6,) [rad/s]; nan for one that gravity makes unstable.
+    """
+    q = _angles(biped, pelvis, np.zeros((1, _DOF)))[0]
+    legs, carried = biped.chains.posture(q.reshape(2, -1)), np.full(2, biped.chains.mass / 2.0)
+    torque = LegLoads(legs, np.array([0.0, 0.0, -biped.gravity]), -carried, np.zeros((2, 3))).torque().ravel()
+    theta = q + torque / stiffness
+
+    def potential(x: Array) -> Array:
+        angles = _angles(biped, pelvis, x)
+        com = biped.chains.center_of_mass(angles.reshape(len(x), 2, -1))
+        height = pelvis[2] + x[:, 2] + (_rotations(x) @ com[..., None])[:, 2, 0]
+        return 0.5 * (stiffness * (theta - angles) ** 2).sum(axis=1) + biped.weight * height
+
+    unit = _STEP * np.eye(_DOF)
+    pairs = unit[:, None] + unit[None]
+    mixed = unit[:, None] - unit[None]
+    ends = np.concatenate([pairs, mixed, -mixed, -pairs]).reshape(-1, _DOF)
+    V = potential(ends).reshape(4, _DOF, _DOF)
+    hessian = (V[0] - V[1] - V[2] + V[3]) / (4.0 * _STEP**2)
+    slopes = (_angles(biped, pelvis, unit) - _angles(biped, pelvis, -unit)).T / (2.0 * _STEP)
+    motion = np.vstack([np.eye(_DOF), slopes])
+    mass = motion.T @ FloatingBody(biped.rigid, biped.joint_names).mass_matrix(q) @ motion
+    eigenvalues = linalg.eigh(hessian, mass, eigvals_only=True)
+    return np.sqrt(np.where(eigenvalues > 0.0, eigenvalues, np.nan))
+
+
+def _rotations(x: Array) -> Array:
+    return rotation_z(x[:, 5]) @ rotation_y(x[:, 4]) @ rotation_x(x[:, 3])
+
+
+def _angles(biped: Biped, pelvis: Array, x: Array) -> Array:
+    """Joint angles that keep both soles on the ground for small pelvis motions, (n, 6) to (n, 12)."""
+    R = _rotations(x)
+    ankles = biped.ankles
+    relative = (ankles - (pelvis + x[:, :3])[:, None]) @ R - biped.hips
+    turned = np.broadcast_to(R.swapaxes(-1, -2)[:, None], (len(x), 2, 3, 3))
+    return leg_angles(biped.leg, relative, turned).reshape(len(x), -1)

@@ -1,0 +1,145 @@
+"""Plans: sampled trajectories of a reference, their building blocks, and tables of them for many worlds."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, BoolArray, IntArray
+
+STAND_S = 1.0
+"""Time at the first position in which policies ramp in; not scored."""
+
+QUINTIC_PEAK_RATE = 15.0 / 8.0
+QUINTIC_PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Samples of a reference at the control rate; row k is the target at the end of control period k, row 0 the start.
+
+    Attributes:
+        q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,) [rad], [rad/s], [rad/s²].
+        scored: Rows that count in metrics, (T,).
+        rest: Number of the window at rest of `Hold`, −1 elsewhere, (T,).
+    """
+
+    q: Array
+    q_dot: Array
+    q_ddot: Array
+    scored: BoolArray
+    rest: IntArray
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps of an episode."""
+        return len(self.q) - 1
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Bounds of a reference over all its plans: range of q [rad], largest |q̇| [rad/s], |q̈| [rad/s²]."""
+
+    lowest: float
+    highest: float
+    q_dot: float
+    q_ddot: float
+
+    @property
+    def q(self) -> float:
+        """Largest |q| [rad]."""
+        return max(-self.lowest, self.highest)
+
+
+def minimum_jerk(s: Array) -> Array:
+    """Minimum-jerk blend 10s³ − 15s⁴ + 6s⁵ from 0 to 1, s clipped to [0, 1]."""
+    s = np.clip(s, 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+def quintic(s: Array) -> tuple[Array, Array, Array]:
+    """`minimum_jerk` and its first two derivatives by s, s clipped to [0, 1]."""
+    blend, s = minimum_jerk(s), np.clip(s, 0.0, 1.0)
+    return (
+        blend,
+        30.0 * s**2 * (1.0 - s) ** 2,
+        60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
+    )
+
+
+def quintic_moves(t: Array, start: float, moves: list[tuple[float, float, float]]) -> tuple[Array, Array, Array]:
+    """Angle, rate, acceleration at times t of moves (begin [s], duration [s], target [rad]) one after the other."""
+    q, q_dot, q_ddot = np.full_like(t, start), np.zeros_like(t), np.zeros_like(t)
+    position = start
+    for begin, duration, target in moves:
+        # before a move nothing of it adds to the angle, after it all does: the rest would cost time alone
+        last = int(np.searchsorted(t, begin + duration)) + 1
+        within = slice(int(np.searchsorted(t, begin)), last)
+        blend, blend_dot, blend_ddot = quintic((t[within] - begin) / duration)
+        q[within] += (target - position) * blend
+        q[last:] += target - position
+        q_dot[within] += (target - position) * blend_dot / duration
+        q_ddot[within] += (target - position) * blend_ddot / duration**2
+        position = target
+    return q, q_dot, q_ddot
+
+
+def control_times(duration_s: float, control_period_s: float) -> Array:
+    """Ends of the control periods within a duration, from 0 [s]."""
+    return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
+
+
+@dataclass(frozen=True)
+class PlanRow:
+    """The reference of every world at its present step, (num_worlds,) each; see `Plan`."""
+
+    q: Array
+    q_dot: Array
+    q_ddot: Array
+    scored: BoolArray
+    rest: IntArray
+
+
+class Planned(Protocol):
+    """A reference, which makes plans of one length."""
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        ...
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan, which depends on the generator only if the reference is random."""
+        ...
+
+
+class PlanTable:
+    """The plans of all worlds as tables, one row per control step; a plan without randomness is held once."""
+
+    def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
+        self._reference, self._period = reference, control_period_s
+        probe = self._reference.plan(np.random.default_rng(0), self._period)
+        self.num_steps = probe.num_steps
+        if not probe.scored.any():
+            raise ConfigurationError(
+                f"the reference has no scored control step: its scored time is below the control period "
+                f"of {control_period_s} s; lengthen it"
+            )
+        self._is_shared = not reference.is_random
+        self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
+        rows = 1 if self._is_shared else num_worlds
+        self._motion = np.tile(np.stack([probe.q, probe.q_dot, probe.q_ddot], axis=-1), (rows, 1, 1))
+        self._scored, self._rest = probe.scored, probe.rest
+
+    def draw(self, world: int, generator: np.random.Generator) -> None:
+        """A new plan for one world."""
+        if not self._is_shared:
+            plan = self._reference.plan(generator, self._period)
+            self._motion[world] = np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1)
+
+    def at(self, step: IntArray) -> PlanRow:
+        """Rows of the given steps, (num_worlds,); beyond the end the last row."""
+        row = np.minimum(step, self.num_steps)
+        motion = self._motion[self._row, row]
+        return PlanRow(motion[:, 0], motion[:, 1], motion[:, 2], self._scored[row], self._rest[row])

@@ -1,0 +1,1 @@
+"""The testbed of the paper: one servo, one spring, one pendulum."""

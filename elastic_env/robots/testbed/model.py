@@ -1,0 +1,88 @@
+r"""The paper's single-joint testbed (Fig. 4): a servo module, a linkage with a pendulum, an IMU on the link.
+
+The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards +x; the torque that holds it is
+τ_g = m g d sin q, 60 N·m at the horizontal. The paper gives neither mass nor length: the range of its static deflection
+(−56 to +42 mrad at 1001 N·m/rad) spans −52.5 to +34.6 N·m, for which 60 N·m leave room; a steel bob of 10 kg, 0.61 m
+from the axis, with a radius of gyration of 0.1 m, is our choice.
+"""
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.make_elastic import Form, transformed
+
+JOINT = "joint"
+GRAVITY_M_S2 = 9.81
+
+
+class Pendulum(Model):
+    """The load of the testbed."""
+
+    gravity_torque: float = quantity("N·m", 60.0, gt=0, description="torque that holds it at the horizontal")
+    mass: float = quantity("kg", 10.0, gt=0, description="mass of bob and linkage")
+    gyration_radius: float = quantity("m", 0.1, gt=0, description="radius of gyration about its center of mass")
+
+    @property
+    def com_distance(self) -> float:
+        """Distance of the center of mass from the joint axis [m]."""
+        return self.gravity_torque / (self.mass * GRAVITY_M_S2)
+
+    @property
+    def inertia(self) -> float:
+        """Moment of inertia I about the joint axis [kg·m²]."""
+        return self.mass * (self.com_distance**2 + self.gyration_radius**2)
+
+    def torque(self, q: Array) -> Array:
+        """Gravity torque τ_g = m g d sin q that holds the pendulum, elementwise [N·m]."""
+        return self.gravity_torque * np.sin(q)
+
+    def torque_gradient(self, q: Array) -> Array:
+        """∂τ_g/∂q, from (..., 1) to (..., 1, 1) [N·m/rad]."""
+        return (self.gravity_torque * np.cos(q))[..., None]
+
+    def with_mass_scaled(self, scale: float) -> "Pendulum":
+        """The same pendulum with another mass at the same place."""
+        return self.replace(mass=self.mass * scale, gravity_torque=self.gravity_torque * scale)
+
+
+def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> mujoco.MjSpec:
+    """The testbed with a rigid joint and no actuator; every inertia is explicit, no geom collides.
+
+    Args:
+        pendulum: The load.
+        gravity: Acceleration of gravity [m/s²]; 0 turns the testbed on its side.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "testbed"
+    spec.compiler.degree = False
+    spec.option.gravity = np.array([0.0, 0.0, -gravity])
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    # a NaN must end the episode, not restart the world behind the task's back
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    link = spec.worldbody.add_body(
+        name="link",
+        mass=pendulum.mass,
+        ipos=[0.0, 0.0, -pendulum.com_distance],
+        inertia=[pendulum.mass * pendulum.gyration_radius**2] * 3,
+        explicitinertial=True,
+    )
+    # the axis points to −y, so that positive q carries the pendulum towards +x
+    link.add_joint(name=JOINT, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, -1.0, 0.0])
+    link.add_site(name="imu", pos=[0.0, 0.0, -0.5 * pendulum.com_distance])
+    return spec
+
+
+def elastic_spec(
+    pendulum: Pendulum,
+    joint: ElasticJoint,
+    form: Form = "tendon",
+    timestep_s: float = 5e-4,
+    gravity: float = GRAVITY_M_S2,
+) -> mujoco.MjSpec:
+    """The testbed with its elastic joint and servo, integrated by RK4."""
+    spec = transformed(rigid_spec(pendulum, gravity), {JOINT: joint}, form)
+    spec.option.timestep = timestep_s
+    return spec

@@ -1,0 +1,83 @@
+"""The testbed's picture: what is drawn at angle x stands at q_ref + factor · (x − q_ref).
+
+The translucent pendulum is the reference, the solid one the link, the blue pointer the rotor.
+"""
+
+import mujoco
+
+from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
+from elastic_env.robots.testbed.model import Pendulum
+
+EXAGGERATION = 8.0
+"""Factor by which deviations from the reference are enlarged."""
+
+_WIDTH, _HEIGHT = 640, 480
+_REFERENCE_RGBA = (0.35, 0.65, 0.45, 0.35)
+_LINK_RGBA = (0.85, 0.45, 0.15, 1.0)
+_STEEL_RGBA = (0.42, 0.44, 0.48, 1.0)
+_HOUSING_RGBA = (0.2, 0.22, 0.26, 1.0)
+_ROTOR_RGBA = (0.15, 0.4, 0.85, 1.0)
+_LEGEND = (("rotor", _ROTOR_RGBA), ("link", _LINK_RGBA), ("reference", (0.27, 0.55, 0.37, 1.0)))
+
+
+def exaggerated(angle: float, reference: float, factor: float = EXAGGERATION) -> float:
+    """Angle at which something is drawn, its deviation from the reference enlarged [rad]."""
+    return reference + factor * (angle - reference)
+
+
+class TestbedPicture(ModelPicture):
+    """The testbed of Fig. 4: housing, rotor pointer, pendulum, and the reference as a translucent pendulum."""
+
+    __test__ = False
+
+    def __init__(self, pendulum: Pendulum) -> None:
+        super().__init__(_display_spec(pendulum), _LEGEND)
+
+    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the signals say it all
+        reference, link = now["reference_angle"], now["link_angle"]
+        rotor = link + now["deflection"]
+        self._data.joint("reference").qpos = reference
+        self._data.joint("link").qpos = exaggerated(link, reference)
+        self._data.joint("rotor").qpos = exaggerated(rotor, reference)
+
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
+        return [
+            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {EXAGGERATION:g}",
+            f"deflection {1e3 * now['deflection']:+7.2f} mrad     link error {1e3 * now['link_error']:+7.2f} mrad",
+        ]
+
+
+def _display_spec(pendulum: Pendulum) -> mujoco.MjSpec:
+    """A model for drawing only: three independent hinges, no dynamics."""
+    spec = mujoco.MjSpec()
+    set_stage(spec, _WIDTH, _HEIGHT)
+    reach = pendulum.com_distance
+    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    world = spec.worldbody
+    world.add_light(
+        pos=[0.3, -2.0, 2.0], dir=[-0.1, 0.8, -0.8], castshadow=False, diffuse=[0.45] * 3, specular=[0.1] * 3
+    )
+    world.add_camera(name=CAMERA, pos=[0.0, -2.25 * reach, -0.22 * reach], xyaxes=[1, 0, 0, 0, 0, 1], fovy=50)
+    world.add_geom(name="housing", type=box, size=[0.07, 0.06, 0.09], pos=[0, 0.12, 0.02], rgba=_HOUSING_RGBA)
+    world.add_geom(name="stand", type=box, size=[0.03, 0.03, 0.6], pos=[0, 0.2, -0.5], rgba=(0.72, 0.74, 0.77, 1))
+    for name, y, rod, bob in (
+        ("reference", 0.03, _REFERENCE_RGBA, _REFERENCE_RGBA),
+        ("link", 0.0, _STEEL_RGBA, _LINK_RGBA),
+    ):
+        body = _hinged(world, name)
+        body.add_geom(name=f"{name}_rod", type=box, size=[0.014, 0.008, reach / 2], pos=[0, y, -reach / 2], rgba=rod)
+        body.add_geom(
+            name=f"{name}_bob", type=cylinder, size=[0.09, 0.025, 0], pos=[0, y, -reach], zaxis=[0, 1, 0], rgba=bob
+        )
+    rotor = _hinged(world, "rotor")
+    rotor.add_geom(name="rotor_disc", type=cylinder, size=[0.055, 0.01, 0], pos=[0, -0.03, 0], zaxis=[0, 1, 0],
+                   rgba=_ROTOR_RGBA)  # fmt: skip
+    rotor.add_geom(name="rotor_pointer", type=box, size=[0.005, 0.004, 0.36 * reach], pos=[0, -0.03, -0.36 * reach],
+                   rgba=_ROTOR_RGBA)  # fmt: skip
+    return spec
+
+
+def _hinged(world: mujoco.MjsBody, name: str) -> mujoco.MjsBody:
+    body = world.add_body(name=name, mass=1.0, inertia=[1.0] * 3, explicitinertial=True)
+    body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, -1.0, 0.0])
+    return body

@@ -1,0 +1,148 @@
+"""Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
+
+from functools import lru_cache
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array, IntArray
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.joint_names import spring_name
+from elastic_env.joint.make_elastic import Form
+from elastic_env.joint.time_step import require_stable
+from elastic_env.motion.gait import Gait
+from elastic_env.motion.walk_plan import plan_walk
+from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, biped, elastic_spec
+from elastic_env.robots.thormang.standing import Equilibrium, settle
+from elastic_env.runtime.scenario import Scenario, make_scenario
+
+FALL_HEIGHT_SHARE = 0.75
+"""A pelvis below this share of its planned height has fallen."""
+FALL_TILT_RAD = 0.4
+"""A pelvis tilted by more than this has fallen [rad]."""
+
+
+class WalkRewardWeights(Model):
+    """Weights of the reward terms; every term is a penalty that grows without saturating."""
+
+    tilt: float = quantity("1/rad", 100.0, ge=0, description="per rad of pelvis error: 1 at 0.01 rad")
+    zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, description="per m of ZMP deviation: 1 at 0.03 m")
+    effort: float = quantity("1/(N·m)", 0.001, ge=0, description="per N·m of servo torque, rms over the joints")
+    smoothness: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offsets, rms over joints")
+    fall: float = quantity("1", 200.0, ge=0, description="once, at a fall or where the simulation diverges")
+    standing: float = quantity(
+        "1", 1.0, ge=0, description="factor of tilt and zmp before and after the walk, where the metrics count nothing"
+    )
+
+
+class WalkConfig(Model):
+    """All of the walking environment."""
+
+    gait: Gait = Gait()
+    scenario: Scenario = make_scenario("nominal")
+    robot: Thormang = Thormang()
+    joints: tuple[ElasticJoint, ...] = tuple(Thormang().joints.values())
+    """The leg joints in order, as they are known; the scenario says in what the true ones differ."""
+    form: Literal["tendon", "rigid"] = "tendon"
+    """Elastic, or rigid for what an inelastic robot would do."""
+    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
+    timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
+    reward: WalkRewardWeights = WalkRewardWeights()
+    bank: int = quantity("1", 0, ge=0, description="bank of robots that a scenario draws from")
+
+    @property
+    def assumed_joints(self) -> dict[str, ElasticJoint]:
+        """The joints as a policy may know them: the ground's friction is known, from an identification."""
+        return {
+            name: joint.replace(
+                coulomb_friction=joint.coulomb_friction * self.scenario.friction_scale,
+                viscous_friction=joint.viscous_friction * self.scenario.friction_scale,
+            )
+            for name, joint in zip(LEG_JOINTS, self.joints, strict=True)
+        }
+
+    @property
+    def true_joints(self) -> dict[str, ElasticJoint]:
+        """The joints as the plant has them, a spread of their stiffness aside."""
+        scenario = self.scenario
+        return {
+            name: joint.replace(
+                stiffness=joint.stiffness * scenario.stiffness_scale,
+                backlash=joint.backlash + scenario.backlash_rad,
+            )
+            for name, joint in self.assumed_joints.items()
+        }
+
+    @property
+    def true_robot(self) -> Thormang:
+        """The robot as the plant has it."""
+        return self.robot.replace(torso_load_kg=self.robot.torso_load_kg + self.scenario.torso_load_kg)
+
+    def true_model(self) -> mujoco.MjModel:
+        """The plant, a spread of stiffness and the direction of a slope aside."""
+        return elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s).compile()
+
+
+class RobotDraw(Model):
+    """What of a robot is drawn: a scenario with a random robot has a bank of these, an episode takes one of them."""
+
+    stiffness_factor: tuple[float, ...] = (1.0,) * len(LEG_JOINTS)
+    encoder_bias_rad: tuple[float, ...] = (0.0,) * len(LEG_JOINTS)
+    slope_direction_rad: float = 0.0
+
+
+BANK_SIZE = 64
+"""Robots in the bank of a scenario that draws them."""
+
+
+@lru_cache(maxsize=64)
+def require_stable_walker(
+    robot: Thormang, joints: tuple[ElasticJoint, ...], form: Form, timestep_s: float, control_period_s: float
+) -> None:
+    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked at once."""
+    spec = elastic_spec(robot, dict(zip(LEG_JOINTS, joints, strict=True)), form, timestep_s)
+    require_stable(spec.compile(), control_period_s)
+
+
+@lru_cache(maxsize=512)
+def equilibrium(config: WalkConfig, draw: RobotDraw) -> Equilibrium:
+    """Where a robot of the bank stands under zero offset, found once."""
+    plan = plan_walk(config.gait, biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
+    model = config.true_model()
+    if config.form == "tendon":
+        springs = spring_ids(model)
+        model.tendon_stiffness[springs] *= np.array(draw.stiffness_factor)
+    model.body("floor").quat[:] = floor_tilt(config.scenario.slope_rad, draw.slope_direction_rad)
+    q = plan.q[0] - np.array(draw.encoder_bias_rad)
+    return settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+
+
+def spring_ids(model: mujoco.MjModel) -> IntArray:
+    """The springs of the leg joints among the tendons of an elastic model, (12,)."""
+    return np.array([model.tendon(spring_name(joint)).id for joint in LEG_JOINTS])
+
+
+def floor_tilt(angle: float, direction: float) -> Array:
+    """Quaternion of a floor that rises by an angle in a direction, both [rad], (4,)."""
+    half = angle / 2.0
+    return np.array([np.cos(half), np.sin(half) * np.sin(direction), -np.sin(half) * np.cos(direction), 0.0])
+
+
+def robot_bank(scenario: Scenario, number: int = 0) -> list[RobotDraw]:
+    """The robots of a scenario: one, or a bank, the same in every process; banks of other numbers have other robots."""
+    if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
+        return [RobotDraw()]
+    generator, n = np.random.default_rng(_BANK_SEED + number), len(LEG_JOINTS)
+    return [
+        RobotDraw(
+            stiffness_factor=tuple((1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()),
+            encoder_bias_rad=tuple((scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()),
+            slope_direction_rad=float(generator.uniform(0.0, 2.0 * np.pi)),
+        )
+        for _ in range(BANK_SIZE)
+    ]
+
+
+_BANK_SEED = 20150

@@ -1,0 +1,190 @@
+"""The humanoid of the paper: THORMANG, 57 kg, twelve leg joints, built from the link table `thormang_legs.csv`.
+
+All link frames are parallel to the pelvis at zero angles; the pelvis frame is the midpoint between the hip axes. x
+forward, y left, z up; joint axes +z (yaw), +x (roll), +y (pitch) on both legs. Sources (public GitHub repositories):
+
+* lengths, masses and COMs of pelvis and legs, hip spacing 0.210 m, sole 0.26 × 0.16 m, ankle 0.100 m above the sole:
+  THORMANG "mk2", UPenn-RoboCup/UPennDev2, Robots/THOROP1/THOROPKinematics.h;
+* inertias of thigh, shank, foot, hip and ankle: THORMANG3 CAD values scaled by mass, from
+  thor-mang/ROBOTIS-THORMANG-Common; hip yaw: a box of 0.16 × 0.08 × 0.10 m, assumed;
+* upper body: torso, waist, bent arms of the same header, head of psh117/thormang_mobile, and 4.7 kg of packs, assumed,
+  to reach the paper's 57 kg;
+* joint limits: THORMANG3, assumed for this robot.
+"""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.biped import Biped
+from elastic_env.dynamics.leg_kinematics import JOINTS, LegGeometry
+from elastic_env.joint.dynamixel import H54_200_S500_R
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.make_elastic import Form, transformed
+
+SIDES = ("l", "r")
+"""Prefixes of the left and the right leg."""
+LEG_JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in JOINTS)
+"""The twelve elastic joints, left leg first, from hip to foot."""
+LEG = LegGeometry(thigh=0.3, shank=0.3)
+ANKLE_HEIGHT_M = 0.1
+"""Height of the ankle axes over the sole [m]."""
+SOLE_HALF_SIZE_M = (0.13, 0.08)
+"""Half length and half width of the sole, whose middle lies under the ankle [m]."""
+
+_SOLE_HALF_THICKNESS = 0.01
+_LOAD_GYRATION_M = 0.1
+_TWIN_KNEE = {"stiffness": 2.0, "rotor_inertia": 2.0, "damping": 2.0, "coulomb_friction": 2.0}
+
+
+class Thormang(Model):
+    """The robot and its published uncertainties."""
+
+    hip_half_spacing: float = quantity("m", 0.105, gt=0, description="half the distance of the hips; 0.072 in mk1")
+    twin_knee: bool = False
+    """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction and torque."""
+    friction: float = quantity("1", 1.0, gt=0, description="friction of the soles on the floor")
+    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="mass carried in the middle of the upper body")
+
+    @property
+    def joints(self) -> dict[str, ElasticJoint]:
+        """The elastic leg joints: the paper's servo on all of them."""
+        return {
+            name: _twin(H54_200_S500_R) if self.twin_knee and "knee" in name else H54_200_S500_R for name in LEG_JOINTS
+        }
+
+
+@lru_cache(maxsize=8)
+def biped(robot: Thormang) -> Biped:
+    """The robot as gait and controller see it."""
+    hips = np.array([[0.0, robot.hip_half_spacing, 0.0], [0.0, -robot.hip_half_spacing, 0.0]])
+    return Biped(rigid_spec(robot).compile(), LEG_JOINTS, LEG, hips, ANKLE_HEIGHT_M, SOLE_HALF_SIZE_M)
+
+
+@dataclass(frozen=True)
+class Link:
+    """A row of the link table, in the link frame and SI units; joint is "fixed", "floating" or the name of a hinge."""
+
+    name: str
+    parent: str
+    joint: str
+    axis: Array
+    position: Array
+    limits: Array | None
+    mass: float
+    com: Array
+    inertia: Array
+    """ixx, iyy, izz, ixy, ixz, iyz about the COM [kg·m²]."""
+
+
+def read_links() -> list[Link]:
+    """The link table, parents before children."""
+    text = resources.files("elastic_env.robots.thormang").joinpath("legs.csv").read_text(encoding="utf-8")
+    return [_link(row) for row in csv.DictReader(text.splitlines())]
+
+
+def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
+    """The robot with rigid joints and no actuator, all inertias explicit, standing over a floor.
+
+    Args:
+        robot: Options.
+        floating: Whether the pelvis is free; False fixes it in the air, for checks of the legs.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "thormang"
+    spec.compiler.degree = False
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0  # with 1, soles creep: 0.2 mm/s down a slope of 1 degree
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    bodies = {"world": spec.worldbody}
+    for link in read_links():
+        body = bodies[link.parent].add_body(
+            name=link.name, pos=_position(link, robot), mass=link.mass, ipos=link.com, fullinertia=link.inertia,
+            explicitinertial=True,
+        )  # fmt: skip
+        bodies[link.name] = body
+        if link.joint == "floating" and floating:
+            body.add_freejoint(name="pelvis")
+        elif link.limits is not None:
+            body.add_joint(name=link.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=link.axis, range=link.limits,
+                           limited=mujoco.mjtLimited.mjLIMITED_TRUE)  # fmt: skip
+    if robot.torso_load_kg > 0.0:
+        torso, load = bodies["upper_body"], robot.torso_load_kg
+        inertia = [load * _LOAD_GYRATION_M**2] * 3
+        torso.add_body(name="load", pos=torso.ipos, mass=load, inertia=inertia, explicitinertial=True)
+    for side in SIDES:
+        _add_sole(bodies[f"{side}_foot"], side, robot.friction)
+    bodies["pelvis"].add_site(name="imu")
+    floor = spec.worldbody.add_body(name="floor")  # a body of its own, so that it can be tilted
+    floor.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
+    return spec
+
+
+def elastic_spec(
+    robot: Thormang, joints: Mapping[str, ElasticJoint], form: Form = "tendon", timestep_s: float = 1e-3
+) -> mujoco.MjSpec:
+    """The robot with elastic leg joints, their servos, and force-torque sensors at the ankles.
+
+    Args:
+        robot: Options.
+        joints: Parameters of the leg joints by name.
+        form: "tendon", or "rigid" for what an inelastic robot would do.
+        timestep_s: Physics step [s].
+    """
+    spec = transformed(rigid_spec(robot), joints, form, actuators="replace")
+    spec.option.timestep = timestep_s
+    for side in SIDES:
+        for kind, name in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):
+            spec.add_sensor(name=f"{side}_{name}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{side}_ft")
+    return spec
+
+
+def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:
+    """Box sole and the site of the force-torque sensor at the ankle."""
+    foot.add_geom(
+        name=f"{side}_sole", type=mujoco.mjtGeom.mjGEOM_BOX, size=[*SOLE_HALF_SIZE_M, _SOLE_HALF_THICKNESS],
+        pos=[0.0, 0.0, _SOLE_HALF_THICKNESS - ANKLE_HEIGHT_M], friction=[friction, 0.005, 0.0001], mass=0.0,
+        condim=4, contype=0, conaffinity=1, priority=1,  # else the larger friction of sole and floor would count
+    )  # fmt: skip
+    foot.add_site(name=f"{side}_ft")
+
+
+def _position(link: Link, robot: Thormang) -> Array:
+    """Position in the parent; the hips stand where the option says."""
+    if link.joint.endswith("hip_yaw"):
+        return np.array([link.position[0], np.sign(link.position[1]) * robot.hip_half_spacing, link.position[2]])
+    return link.position
+
+
+def _twin(joint: ElasticJoint) -> ElasticJoint:
+    servo = joint.servo
+    doubled = {name: factor * getattr(joint, name) for name, factor in _TWIN_KNEE.items()}
+    if servo is not None:
+        gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit")
+        doubled["servo"] = servo.replace(**{gain: 2.0 * getattr(servo, gain) for gain in gains})
+    return joint.replace(**doubled)
+
+
+def _link(row: dict[str, str]) -> Link:
+    def numbers(*names: str) -> Array:
+        return np.array([float(row[name]) for name in names])
+
+    return Link(
+        name=row["name"],
+        parent=row["parent"],
+        joint=row["joint"],
+        axis=numbers("axis_x", "axis_y", "axis_z"),
+        position=numbers("x_m", "y_m", "z_m"),
+        limits=numbers("lower_rad", "upper_rad") if row["lower_rad"] else None,
+        mass=float(row["mass_kg"]),
+        com=numbers("com_x", "com_y", "com_z"),
+        inertia=numbers("ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
+    )

@@ -1,0 +1,166 @@
+"""The walker's picture: the tilt and the position error of the pelvis are drawn enlarged, the feet where they are.
+
+Relative to the feet the pelvis stands at planned + factor · (true − planned), in position and attitude; the feet, the
+ZMP and its reference are drawn to scale, so that the robot stands on the floor and the ZMP is where it is under the
+soles. The legs connect both, which enlarges the link errors of the supporting leg to first order by the same factor.
+The factor becomes smaller, down to one, where the legs could not reach the feet: a fall is drawn as it is. The
+translucent robot is the plan.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.biped import Biped
+from elastic_env.dynamics.contact_force import shares
+from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles
+from elastic_env.motion.gait import LEFT
+from elastic_env.motion.walk_plan import WalkPlan
+from elastic_env.rendering.picture import ModelPicture
+from elastic_env.robots.thormang.humanoid import (
+    GRID_M,
+    LEFT_RGBA,
+    PLAN,
+    RIGHT_RGBA,
+    ZMP,
+    ZMP_REFERENCE,
+    ZMP_REFERENCE_RGBA,
+    ZMP_RGBA,
+    display_spec,
+)
+from elastic_env.robots.thormang.model import LEG_JOINTS
+from elastic_env.robots.thormang.rows import WalkTruth
+from elastic_env.robots.thormang.tables import FELL
+from elastic_env.robots.thormang.task import WalkTask
+
+LARGEST_FACTOR = 3.0
+"""Factor by which deviations of the pelvis are enlarged, as far as the legs reach."""
+
+_NUM_FACTORS = 81
+_ALMOST = 1.0 - 1e-9
+_BELOW_THE_FLOOR = (0.0, 0.0, -1.0)
+_LEGEND = (
+    ("left", LEFT_RGBA),
+    ("right", RIGHT_RGBA),
+    ("plan", (0.35, 0.66, 0.45, 1.0)),
+    ("ZMP", ZMP_RGBA),
+    ("ZMP reference", ZMP_REFERENCE_RGBA),
+    (f"grid {GRID_M:g} m", (0.55, 0.57, 0.60, 1.0)),
+)
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Where pelvis and feet are, in the world frame.
+
+    Attributes:
+        pelvis, R: Position [m] and orientation of the pelvis, (3,), (3, 3).
+        ankles, feet_R: Positions of the ankles [m] and orientations of the feet, left and right, (2, 3), (2, 3, 3).
+    """
+
+    pelvis: Array
+    R: Array
+    ankles: Array
+    feet_R: Array
+
+    @classmethod
+    def true(cls, truth: WalkTruth, world: int = 0) -> "Posture":
+        """That of a world."""
+        R = truth.pelvis_R[world]
+        feet_R = R @ foot_pose(truth.model.biped.leg, truth.q[world].reshape(2, -1))[1]
+        return cls(truth.pelvis[world], R, truth.ankles[world], feet_R)
+
+    @classmethod
+    def planned(cls, plan: WalkPlan, row: int) -> "Posture":
+        """That of the plan, with pelvis and feet level."""
+        level = np.eye(3)
+        return cls(plan.pelvis[row], level, plan.ankles[row], np.stack([level, level]))
+
+    def joint_angles(self, robot: Biped) -> Array:
+        """The joint angles that go with it, of a straight leg where a foot is out of reach, (12,) [rad]."""
+        legs = hip_to_ankle(robot, self.pelvis, self.R, self.ankles)
+        stretch = np.linalg.norm(legs, axis=-1, keepdims=True) / (_ALMOST * robot.leg.reach)
+        return leg_angles(robot.leg, legs / np.maximum(stretch, 1.0), self.R.T @ self.feet_R).ravel()
+
+
+def hip_to_ankle(robot: Biped, pelvis: Array, R: Array, ankles: Array) -> Array:
+    """Ankles as seen from the hips, in the frame of the pelvis, for pelvis poses (..., 3), (..., 3, 3); (..., 2, 3)."""
+    return (ankles - pelvis[..., None, :]) @ R - robot.hips
+
+
+def enlarged(
+    true: Posture, planned: Posture, share: Array | float, robot: Biped, largest: float = LARGEST_FACTOR
+) -> tuple[Posture, float]:
+    """The posture that is drawn, and the factor of its deviations.
+
+    Args:
+        true: What the robot does; its feet stay where they are.
+        planned: What it should do, its pelvis level.
+        share: Share μ of the weight on the right foot: the pelvis deviates relative to the feet that carry it.
+        robot: Legs that have to reach the feet.
+        largest: The factor, if they do.
+    """
+    factors = np.linspace(largest, 1.0, _NUM_FACTORS)
+    origin = planned.pelvis + shares(np.asarray(share)) @ (true.ankles - planned.ankles)
+    pelvis = origin + factors[:, None] * (true.pelvis - origin)
+    R = Rotation.from_rotvec(np.outer(factors, Rotation.from_matrix(true.R).as_rotvec())).as_matrix()
+    reaches = (np.linalg.norm(hip_to_ankle(robot, pelvis, R, true.ankles), axis=-1) <= robot.leg.reach).all(axis=-1)
+    reaches[-1] = True  # the true posture
+    chosen = int(np.argmax(reaches))
+    return Posture(pelvis[chosen], R[chosen], true.ankles, true.feet_R), float(factors[chosen])
+
+
+class WalkerPicture(ModelPicture):
+    """The walker with its plan, the ZMP and its reference.
+
+    Args:
+        task: Rules of the worlds whose true state is drawn.
+    """
+
+    def __init__(self, task: WalkTask) -> None:
+        super().__init__(display_spec(task.config.robot), _LEGEND)
+        self._task = task
+        self._factor = LARGEST_FACTOR
+
+    def _pose(self, now: dict[str, float], world: int) -> None:
+        plan = self._task.plan
+        row = min(round(now["time_s"] / self._task.config.control_period_s), plan.num_steps)
+        truth = self._task.truth()
+        true, planned, robot = Posture.true(truth, world), Posture.planned(plan, row), truth.model.biped
+        drawn, self._factor = enlarged(true, planned, plan.share[row], robot)
+        self._place("", drawn, robot)
+        self._place(PLAN, planned, robot)
+        for marker in (ZMP, ZMP_REFERENCE):
+            self._mark(marker, now[f"{marker}_x"], now[f"{marker}_y"])
+
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:
+        failures = [FELL] if self._task.has_fallen()[world] else []
+        deviation = now["zmp_deviation"]
+        zmp = "no ground contact" if np.isnan(deviation) else f"ZMP deviation {1e3 * deviation:5.1f} mm"
+        return [
+            "     ".join([f"t = {now['time_s']:6.2f} s", _phase(now), *failures]),
+            f"roll {1e3 * now['pelvis_roll']:+6.1f} mrad     pitch {1e3 * now['pelvis_pitch']:+6.1f} mrad     {zmp}",
+            f"tilt and shift of the pelvis drawn x {self._factor:.2g}     feet and ZMP to scale",
+        ]
+
+    def _place(self, prefix: str, posture: Posture, robot: Biped) -> None:
+        """Bring one of the two robots into a posture."""
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, posture.R.ravel())
+        self._data.joint(f"{prefix}pelvis").qpos = [*posture.pelvis, *quaternion]
+        for joint, angle in zip(LEG_JOINTS, posture.joint_angles(robot), strict=True):
+            self._data.joint(prefix + joint).qpos = angle
+
+    def _mark(self, marker: str, x: float, y: float) -> None:
+        """Lay a marker on the floor, or hide it where there is no such point."""
+        place = _BELOW_THE_FLOOR if np.isnan(x) else (x, y, 0.0)
+        self._data.mocap_pos[self._model.body(marker).mocapid[0]] = place
+
+
+def _phase(now: dict[str, float]) -> str:
+    if not now["single_support"]:
+        return "double support"
+    return "left support" if now["support"] == LEFT else "right support"

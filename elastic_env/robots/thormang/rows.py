@@ -1,0 +1,161 @@
+"""The walker's truth, measurements and scores: one row per world, fields by name.
+
+NumPy's structured types, which Numba compiles as they stand: `row.theta[i]` in a kernel, `rows["theta"]` in NumPy.
+Truth is what the physics did, measurements are what sensors show of it, and nothing is in both.
+"""
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.core.rows import Rows
+from elastic_env.core.signals import Array
+from elastic_env.robots.thormang.model import LEG_JOINTS
+from elastic_env.runtime.robot_model import WalkerModel
+
+Records: TypeAlias = npt.NDArray[Any]
+"""An array of one of these types, one row per world."""
+
+REAL, WHOLE = np.float64, np.int64
+JOINTS = len(LEG_JOINTS)
+
+
+def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
+    """A structured type whose rows have their fields as attributes, compiled or not."""
+    return np.dtype((np.record, list(fields)))
+
+
+_FEET_WRENCH = (2, 2, 3)  # feet, force and moment, axes
+
+TRUTH = record_type(
+    ("step", WHOLE),  # control steps since the start of the episode
+    ("theta", REAL, JOINTS), ("theta_dot", REAL, JOINTS),  # motor side [rad], [rad/s]
+    ("q", REAL, JOINTS), ("q_dot", REAL, JOINTS),  # link side [rad], [rad/s]
+    ("servo_torque", REAL, JOINTS),  # [N·m]
+    ("stiffness", REAL, JOINTS),  # true K [N·m/rad]
+    ("offset", REAL, JOINTS), ("command", REAL, JOINTS),  # a, and θ_cmd = q_ref + a [rad]
+    ("command_rate", REAL),  # rms over the joints of the change of a [rad/s]
+    ("pelvis", REAL, 3), ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
+    ("pelvis_rate", REAL, 3),  # in the frame of the pelvis [rad/s]
+    ("roll", REAL), ("pitch", REAL), ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
+    ("ankles", REAL, (2, 3)),  # positions [m]
+    ("wrench", REAL, _FEET_WRENCH),  # of the feet on the legs, in the frames of the feet [N], [N·m]
+    ("force", REAL, 2),  # vertical force of the ground on the feet [N]
+    ("zmp", REAL, 2),  # [m], nan where the feet are not loaded
+    ("contact_since", WHOLE),  # step of the first touch in the second half of the swing, -1 before it
+)  # fmt: skip
+"""What the physics did in a control step."""
+
+MEASURED = record_type(
+    ("encoder", REAL, JOINTS), ("encoder_before", REAL, JOINTS),  # now and one control step ago [rad]
+    ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
+    ("wrench", REAL, _FEET_WRENCH),  # as in the truth
+)  # fmt: skip
+"""What the sensors show."""
+
+NOISE = record_type(("imu_attitude", REAL, 2), ("imu_rate", REAL, 3), ("wrench", REAL, _FEET_WRENCH))
+"""Standard normal samples of a control step [1]."""
+
+BIAS = record_type(("encoder", REAL, JOINTS), ("imu_attitude", REAL, 2))
+"""Errors of homing and mounting, drawn per episode [rad]."""
+
+SCORES = record_type(("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL))
+"""Weighted terms of the reward."""
+
+STEP = record_type(("truth", TRUTH), ("measured", MEASURED), ("scores", SCORES))
+"""A control step of a world."""
+
+ROW_OF_PLAN = record_type(
+    ("q", REAL, JOINTS), ("q_dot", REAL, JOINTS), ("q_ddot", REAL, JOINTS),  # [rad], [rad/s], [rad/s²]
+    ("clock", REAL, 3), ("share", REAL), ("zmp", REAL, 2),  # time, swing, support; μ; [m]
+    ("half_of_swing", WHOLE), ("swing_foot", WHOLE),
+    ("imu_is_due", np.bool_), ("weight", REAL),  # factor of tilt and zmp in the reward
+)  # fmt: skip
+"""What a control step needs of the plan."""
+
+QUALITY = record_type(
+    ("count_rad", REAL),  # of the encoders, 0 for none
+    ("imu_noise_rad", REAL), ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL),
+    ("gyro_noise_rad_s", REAL), ("force_noise_n", REAL), ("moment_noise_nm", REAL),
+)  # fmt: skip
+"""Quality of the sensors: standard deviations and constant errors."""
+
+RULES = record_type(
+    ("control_period_s", REAL), ("is_delayed", np.bool_),  # whether measurements are shown a step late
+    ("lowest_pelvis_m", REAL), ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
+    ("highest_rad_s", REAL),  # beyond it the simulation has diverged
+    ("loaded_n", REAL),  # vertical force of a loaded foot
+    ("zmp_n", REAL),  # least vertical force for a ZMP
+    ("weights", SCORES),
+)  # fmt: skip
+"""Numbers that judge a control step."""
+
+ADDRESSES = record_type(
+    ("theta", WHOLE, JOINTS), ("q", WHOLE, JOINTS),  # in qpos
+    ("theta_dot", WHOLE, JOINTS), ("q_dot", WHOLE, JOINTS),  # in qvel
+    ("ankles", WHOLE, 2),  # among the sites
+)  # fmt: skip
+"""Where the joints stand in the physics; the pelvis comes first."""
+
+CONSTANTS = record_type(
+    ("at", ADDRESSES),
+    ("foot_com", REAL, (2, 3)), ("foot_weight", REAL, (2, 3)),  # from the ankle [m], in the world [N]
+    ("quality", QUALITY), ("rules", RULES),
+)  # fmt: skip
+"""What does not change."""
+
+OBSERVED = record_type(
+    ("encoder_angle", REAL, JOINTS), ("encoder_rate", REAL, JOINTS),
+    ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3), ("wrench", REAL, _FEET_WRENCH),
+    ("reference_angle", REAL, JOINTS), ("reference_rate", REAL, JOINTS), ("reference_acceleration", REAL, JOINTS),
+    ("clock", REAL, 3), ("load_share", REAL), ("zmp_reference", REAL, 2),
+    ("last_command", REAL, JOINTS),
+)  # fmt: skip
+"""Columns of the observation, see `elastic_env.robots.thormang.task`."""
+
+
+def one(kind: np.dtype[Any], **values: Any) -> Records:
+    """One row with these values, (1,)."""
+    row = np.zeros(1, kind)
+    for name in row.dtype.names or ():
+        row[name] = values.pop(name)
+    assert not values
+    row.flags.writeable = False
+    return row
+
+
+@dataclass(frozen=True, slots=True)
+class WalkSample(Rows):
+    """What a control step is scored by.
+
+    Attributes:
+        rows: Of `STEP`, (n,).
+    """
+
+    rows: Records
+
+
+@dataclass(frozen=True)
+class WalkTruth:
+    """Noise-free state of the walker and its true parameters, one row per world. For scoring and the oracle.
+
+    Attributes:
+        theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, 12) [rad], [rad/s].
+        pelvis: Position of the pelvis, (num_worlds, 3) [m].
+        pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
+        ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
+        stiffness: True K, (num_worlds, 12) [N·m/rad].
+        model: The true joints and masses, a spread of stiffness aside.
+    """
+
+    theta: Array
+    theta_dot: Array
+    q: Array
+    q_dot: Array
+    pelvis: Array
+    pelvis_R: Array
+    ankles: Array
+    stiffness: Array
+    model: WalkerModel

@@ -1,0 +1,321 @@
+"""Gymnasium faces of the worlds: one world as an `Env`, many as a `VectorEnv`."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array, BoolArray, Signals
+from elastic_env.rendering.picture import Picture
+from elastic_env.runtime.physics import Simulation
+from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.runtime.step_info import StepInfo
+from elastic_env.runtime.task import Task
+from elastic_env.runtime.worlds import Transition, Worlds
+
+Observation: TypeAlias = npt.NDArray[Any]
+Action: TypeAlias = npt.NDArray[Any]
+
+RENDER_MODES = ("rgb_array", "human")
+
+
+class _Faces:
+    """What both environments show of their worlds."""
+
+    _worlds: Worlds
+    _picture: Picture | None = None
+    _make_picture: Callable[[], Picture] | None = None
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made this environment, with the length of its episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and spec.max_episode_steps is None:
+            spec = dataclasses.replace(spec, max_episode_steps=self.task.num_steps)
+        self._spec = spec
+
+    @property
+    def assumed_model(self) -> RobotModel:
+        """What a compensator may know of the robot."""
+        return self._worlds.task.assumed_model
+
+    @property
+    def task(self) -> Task:
+        """The rules of this environment."""
+        return self._worlds.task
+
+    @property
+    def simulation(self) -> Simulation:
+        """The physics, for benchmarks and tests; a policy has no business here."""
+        return self._worlds.simulation
+
+    def truth(self) -> Any:
+        """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
+        return self._worlds.task.truth()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but window and renderer, which are made again when they are needed."""
+        return {**vars(self), "_picture": None}
+
+    def _let_go(self) -> None:
+        """Close the window, free the renderer, let hardware go."""
+        self._worlds.simulation.close()
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
+
+    def _draw(self) -> Picture:
+        if self._picture is None:
+            if self._make_picture is None:
+                raise ConfigurationError("this environment has no picture")
+            self._picture = self._make_picture()
+        return self._picture
+
+
+class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """One world of a task.
+
+    Args:
+        task: The rules, for one world.
+        render_mode: "rgb_array", "human" or None.
+        picture: Makes the picture of the task when it is first rendered.
+        simulation: What moves instead of MuJoCo, such as hardware.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
+
+    def __init__(
+        self,
+        task: Task,
+        render_mode: str | None,
+        picture: Callable[[], Picture],
+        simulation: Simulation | None = None,
+    ) -> None:
+        if render_mode not in (None, *RENDER_MODES):
+            raise unknown_name("render mode", render_mode, RENDER_MODES)
+        self.render_mode = render_mode
+        self.observation_space = task.observation_table.space(np.float64)
+        self.action_space = task.action_table.space(np.float32)
+        self._worlds = Worlds(task, num_threads=1, is_scalar=True, simulation=simulation)
+        self._make_picture = picture
+        self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; `options` are not used."""
+        super().reset(seed=seed, options=options)
+        self._worlds.restart(np.ones(1, dtype=np.bool_), [self.np_random])
+        self._steps = 0
+        self._render_human()
+        return self._worlds.task.observe()[0], _first(self._worlds.signals())
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control period under a command offset [rad]."""
+        result = self._worlds.step(np.asarray(action)[None])
+        self._steps += 1
+        self._render_human()
+        return (
+            result.observation[0],
+            float(result.reward[0]),
+            bool(result.terminated[0]),
+            bool(result.truncated[0]),
+            StepInfo({}, lambda: _first(result.info)),
+        )
+
+    def render(self) -> Any:
+        """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
+        return self._draw().rgb(self._worlds.signals()) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, free the renderer, let hardware go."""
+        self._let_go()
+
+    def _render_human(self) -> None:
+        if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
+            self._draw().show(self._worlds.signals())
+
+
+class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
+    _Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+):
+    """Many worlds of a task on a thread pool.
+
+    World i of `reset(seed=s)` is the scalar environment of `reset(seed=s + i)`, exactly, whatever the number of worlds
+    and threads.
+
+    Args:
+        task: The rules, for num_envs worlds.
+        num_threads: Threads of the physics, 0 for all cores.
+        autoreset_mode: Gymnasium's `AutoresetMode` or its value.
+        simulation: What moves instead of MuJoCo, such as hardware.
+        render_mode: "rgb_array" or None.
+        picture: Makes the picture of the task when it is first rendered.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_threads: int = 0,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        simulation: Simulation | None = None,
+        render_mode: str | None = None,
+        picture: Callable[[], Picture] | None = None,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise unknown_name("render mode of a vector environment", render_mode, ["rgb_array"])
+        self.render_mode, self._make_picture = render_mode, picture
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            raise unknown_name("autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode]) from None
+        self.num_envs = task.num_worlds
+        self.single_observation_space = task.observation_table.space(np.float64)
+        self.single_action_space = task.action_table.space(np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._worlds = Worlds(task, num_threads, simulation=simulation)
+        self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
+        self._done = np.zeros(self.num_envs, dtype=np.bool_)
+        self._is_begun = False
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode in every world, or in those of options["reset_mask"]."""
+        mask = np.ones(self.num_envs, dtype=np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = _checked_mask(options["reset_mask"], self.num_envs)
+        seeds = _seeds(seed, self.num_envs)
+        for world in np.flatnonzero(mask):
+            if seeds[world] is not None:
+                self._generators[world] = seeding.np_random(seeds[world])[0]
+        self._begin(mask)
+        self._is_begun = True
+        return self._worlds.task.observe(), self._worlds.signals()
+
+    def step(
+        self, actions: Action
+    ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
+        """One control period in every world under command offsets, (num_envs, n) [rad]."""
+        if not self._is_begun:
+            raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
+        restarting, given = self._done, np.asarray(actions)
+        some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
+        if some_restart and given.shape == self.action_space.shape:
+            given = np.where(restarting[:, None], 0.0, given)
+        result = self._worlds.step(given)
+        if some_restart:
+            result = self._restarted_instead(result, restarting)
+        self._done = done = result.done
+        observation, info = result.observation, result.info
+        if done.any():
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                observation, info = self._restarted_after(result)
+            else:
+                info = _with_mask(info, done)
+        return observation, result.reward, result.terminated, result.truncated, info
+
+    @property
+    def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What Gymnasium's wrappers ask for."""
+        return {**ElasticEnv.metadata, "render_modes": ["rgb_array"], "autoreset_mode": self.autoreset_mode}
+
+    def render(self) -> tuple[Observation, ...] | None:
+        """The present picture of every world, (height, width, 3) uint8, which takes some 20 ms each."""
+        if self.render_mode is None:
+            return None
+        signals = self._worlds.signals()
+        return tuple(self._draw().rgb(signals, world) for world in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
+        """Free the renderer, let hardware go."""
+        self._let_go()
+
+    def _begin(self, worlds: BoolArray) -> None:
+        self._worlds.restart(worlds, self._generators)
+        self._done = self._done & ~worlds
+
+    def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
+        """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
+        self._begin(worlds)
+        fresh = self._worlds.signals()
+        info = _restarted_info(result.info, worlds, fresh)
+        terminated, truncated = result.terminated & ~worlds, result.truncated & ~worlds
+        if not (terminated | truncated).any():  # what ended had ended before
+            info = _without_metrics(info)
+        return Transition(
+            self._worlds.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info
+        )
+
+    def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
+        """SAME_STEP: the worlds that end begin anew at once; their last observation and info are kept beside."""
+        final_observation = np.full(self.num_envs, None, dtype=object)
+        for world in np.flatnonzero(result.done):
+            final_observation[world] = result.observation[world].copy()
+        final_info = _with_mask(result.info, result.done)
+        self._begin(result.done)
+        fresh = self._worlds.signals()
+        info = _without_metrics(_restarted_info(result.info, result.done, fresh))
+        info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
+        info |= {"final_info": final_info, "_final_info": result.done.copy()}
+        return self._worlds.task.observe(), info
+
+
+def _seeds(seed: Any, num_envs: int) -> list[int | None]:
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + i for i in range(num_envs)]
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+        raise ConfigurationError(f"seed must be a whole number, one per world ({num_envs}), or None; got {seed!r}")
+    if len(seed) != num_envs:
+        raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
+    return [None if one is None else int(one) for one in seed]
+
+
+def _checked_mask(mask: Any, num_envs: int) -> BoolArray:
+    given = np.asarray(mask)
+    if given.dtype != np.bool_ or given.shape != (num_envs,):
+        raise ConfigurationError(
+            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got {mask!r}"
+        )
+    return given
+
+
+def _restarted_info(info: dict[str, Any], worlds: BoolArray, fresh: Signals) -> dict[str, Any]:
+    """The info of a step in which some worlds begin anew: theirs is that of the reset."""
+    changed = info | {key: np.where(worlds, value, info[key]) for key, value in fresh.items()}
+    changed["reward_terms"] = {key: np.where(worlds, 0.0, term) for key, term in info["reward_terms"].items()}
+    changed["termination"] = np.where(worlds, "", info["termination"])
+    changed["clipped"] = np.where(worlds, 0.0, info["clipped"])
+    return changed
+
+
+def _without_metrics(info: dict[str, Any]) -> dict[str, Any]:
+    """The info of a step in which no episode has ended."""
+    return {key: value for key, value in info.items() if key not in ("episode_metrics", "_episode_metrics")}
+
+
+def _with_mask(info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
+    """Episode metrics with Gymnasium's mark of the worlds that have them."""
+    info["_episode_metrics"] = done.copy()
+    return info
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    """The info of the only world, with Python scalars."""
+    return {key: _first(value) if isinstance(value, dict) else value[0].item() for key, value in info.items()}

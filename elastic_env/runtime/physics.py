@@ -1,0 +1,272 @@
+"""N worlds of one MuJoCo model: a thread pool for many, plain `mj_step` for one, the same results bit for bit.
+
+Arrays are (num_worlds, ...) views of the live state. All sub-steps of a control period are one call.
+"""
+
+import copy
+import ctypes
+import os
+import warnings
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+from mujoco import batch
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, BoolArray, IntArray
+
+
+class Simulation(Protocol):
+    """What a task needs of the physics. The state arrays are live views; writing `ctrl` commands the next advance."""
+
+    model: mujoco.MjModel
+    num_worlds: int
+    qpos: Array
+    qvel: Array
+    act: Array
+    ctrl: Array
+
+    def bind(self, field: str) -> Array:
+        """A live (num_worlds, ...) view of a field of `MjData`.
+
+        Inputs such as `xfrc_applied` can be written. Derived fields and sensors lag one physics step behind the state,
+        as after `mj_step`; they are filled by the calls after they were first bound, so bind them before `refresh`.
+        """
+        ...
+
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """Several fields bound."""
+        ...
+
+    def vary(self, field: str) -> Array:
+        """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now on."""
+        ...
+
+    def advance(self, num_substeps: int) -> None:
+        """Step every world by `num_substeps` physics steps under its current `ctrl`."""
+        ...
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """Compute derived fields and sensors of the present state in some worlds, a (num_worlds,) mask."""
+        ...
+
+    def restart(self, worlds: BoolArray) -> None:
+        """Set some worlds, a (num_worlds,) mask, to the model's defaults; write their state afterwards."""
+        ...
+
+    def diverged(self) -> BoolArray:
+        """Worlds whose state, acceleration or control has been a bad number since their restart, (num_worlds,)."""
+        ...
+
+    def close(self) -> None:
+        """Give back what it holds; hardware loses its torque."""
+        ...
+
+
+DIVERGED_RAD_S = 1e3
+"""Speed of a joint beyond anything physical [rad/s]: two hundred times the no-load speed of the servos."""
+
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
+_OTHERS = {
+    int(mujoco.mjtWarning.mjWARN_INERTIA): "a nearly singular inertia matrix: look at the inertias of its bodies",
+    int(mujoco.mjtWarning.mjWARN_CONTACTFULL): 'too many contacts for its memory: enlarge <size memory="..."/>',
+    int(mujoco.mjtWarning.mjWARN_CNSTRFULL): 'too many constraints for its memory: enlarge <size memory="..."/>',
+}
+
+
+class _Warnings:
+    """What MuJoCo warns of: bad numbers, which end an episode, and anything else, which is said once."""
+
+    def __init__(self) -> None:
+        self._said: set[int] = set()
+
+    def diverged(self, counts: IntArray) -> BoolArray:
+        """Worlds with a bad number, from the counts of all warnings, (num_worlds, kinds)."""
+        if not counts.any():
+            return np.zeros(len(counts), dtype=np.bool_)
+        is_bad = np.asarray(counts[:, _BAD].any(axis=1))
+        for kind in np.flatnonzero(counts[~is_bad].any(axis=0)).tolist():  # what explodes has every fault
+            if kind in _OTHERS and kind not in self._said:
+                self._said.add(kind)
+                warnings.warn(f"MuJoCo goes on, less exact; the model has {_OTHERS[kind]}", stacklevel=2)
+        return is_bad
+
+
+class SingleWorld:
+    """One world on `mj_step`."""
+
+    num_worlds = 1
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.__setstate__({"model": model, "varies": False, "data": mujoco.MjData(model), "warnings": _Warnings()})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the live views, for `copy.deepcopy` and pickle."""
+        return {"model": self.model, "varies": self._varies, "data": self._data, "warnings": self._warnings}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.model, self._varies = state["model"], state["varies"]
+        self._data, self._warnings = state["data"], state["warnings"]
+        self._counts, self._views = self._data.warning.number[None], dict[tuple[str, ...], tuple[Array, ...]]()
+        self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
+        self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
+
+    def bind(self, field: str) -> Array:
+        """See `Simulation`."""
+        return getattr(self._data, field)[None]
+
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """See `Simulation`."""
+        if fields not in self._views:
+            self._views[fields] = tuple(self.bind(field) for field in fields)
+        return self._views[fields]
+
+    def vary(self, field: str) -> Array:
+        """See `Simulation`."""
+        if not self._varies:
+            self.model, self._varies = copy.copy(self.model), True
+        return getattr(self.model, field)[None]
+
+    def advance(self, num_substeps: int) -> None:
+        """See `Simulation`."""
+        mujoco.mj_step(self.model, self._data, num_substeps)
+
+    def restart(self, worlds: BoolArray) -> None:
+        """See `Simulation`."""
+        if worlds[0]:
+            mujoco.mj_resetData(self.model, self._data)
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """See `Simulation`."""
+        if worlds[0]:
+            mujoco.mj_forward(self.model, self._data)
+
+    def diverged(self) -> BoolArray:
+        """See `Simulation`."""
+        return self._warnings.diverged(self._counts)
+
+    def close(self) -> None:
+        """See `Simulation`; there is nothing to give back."""
+
+
+class ManyWorlds:
+    """Many worlds on `mujoco.batch`, stepped by a pool of threads."""
+
+    def __init__(self, model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> None:
+        threads = min(num_threads or os.cpu_count() or 1, num_worlds)
+        self._start(model, num_worlds, threads, _Warnings())
+
+    def _start(self, model: mujoco.MjModel, num_worlds: int, num_threads: int, said: _Warnings) -> None:
+        """Begin with worlds in the model's default state, and threads of this process."""
+        self.model, self.num_worlds, self._warnings, self._process = model, num_worlds, said, os.getpid()
+        self._varied: set[str] = set()
+        self._bound: set[str] = set()
+        self._views: dict[tuple[str, ...], tuple[Array, ...]] = {}
+        self._batch = batch.Batch(model, nsim=num_worlds, nthread=num_threads)
+        self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self.act, self.ctrl = self._batch.bind("act"), self._batch.bind("ctrl")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a process that was forked."""
+        made = (self.model, self.num_worlds, self._batch.nthread, self._warnings)
+        return {"made": made, "worlds": self.get_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._start(*state["made"])
+        self.set_state(state["worlds"])
+
+    def _own(self) -> batch.Batch:
+        """The batch, with threads of this process: those of a parent are not there after a fork."""
+        if self._process != os.getpid():
+            inherited = self._batch
+            # its end would wait for threads that are not there: it is never freed
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(inherited))
+            self.__setstate__(self.__getstate__())
+        return self._batch
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything that goes on from here: integration states, outputs, warnings, varied fields of the model."""
+        outputs = {field: self.bind(field).copy() for field in sorted(self._bound)}
+        varied = {field: self.vary(field).copy() for field in sorted(self._varied)}
+        state, warning = self._batch.state.copy(), self._batch.warning.copy()
+        return {"state": state, "warning": warning, "outputs": outputs, "varied": varied}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state that `get_state` returned; outputs are filled again by the next step."""
+        for field, values in state["varied"].items():
+            self.vary(field)[:] = values
+        for field in state["outputs"]:
+            self.bind(field)
+        self._batch.state[:] = state["state"]
+        self._batch.warning[:] = state["warning"]
+
+    def bind(self, field: str) -> Array:
+        """See `Simulation`."""
+        self._bound.add(field)
+        return self._batch.bind(field)
+
+    def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
+        """See `Simulation`."""
+        if fields not in self._views:
+            self._views[fields] = tuple(self.bind(field) for field in fields)
+        return self._views[fields]
+
+    def vary(self, field: str) -> Array:
+        """See `Simulation`."""
+        self._varied.add(field)
+        return self._batch.expand(field)
+
+    def advance(self, num_substeps: int) -> None:
+        """See `Simulation`."""
+        self._own().step(nstep=num_substeps)
+
+    def restart(self, worlds: BoolArray) -> None:
+        """See `Simulation`."""
+        if worlds.any():
+            self._own().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """See `Simulation`."""
+        if worlds.any():
+            self._own().forward(worlds)
+
+    def diverged(self) -> BoolArray:
+        """See `Simulation`."""
+        return self._warnings.diverged(self._batch.warning[..., 1])
+
+    def close(self) -> None:
+        """See `Simulation`; there is nothing to give back."""
+
+
+def simulate(model: mujoco.MjModel, num_worlds: int, num_threads: int = 0) -> Simulation:
+    """The fastest simulation for a number of worlds.
+
+    Args:
+        model: The model of every world.
+        num_worlds: How many.
+        num_threads: Threads for many worlds, 0 for all cores; the results do not depend on it.
+    """
+    return SingleWorld(model) if num_worlds == 1 else ManyWorlds(model, num_worlds, num_threads)
+
+
+_MOST_SUBSTEPS = 1000
+
+
+def substeps(control_period_s: float, timestep_s: float) -> int:
+    """Physics steps in a control period.
+
+    Raises:
+        ConfigurationError: The control period is no multiple of the physics step, or holds too many of them.
+    """
+    ratio = control_period_s / timestep_s
+    if ratio > _MOST_SUBSTEPS:
+        raise ConfigurationError(
+            f"timestep_s must be at least {control_period_s / _MOST_SUBSTEPS:g} s, a {_MOST_SUBSTEPS}th of the control "
+            f"period, got {timestep_s:g} s"
+        )
+    if abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+        raise ConfigurationError(
+            f"timestep_s must divide the control period of {control_period_s:g} s, got {timestep_s:g} s"
+        )
+    return round(ratio)

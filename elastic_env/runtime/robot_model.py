@@ -1,0 +1,153 @@
+"""What a compensator may know of a robot: its rigid model and the parameters of its elastic joints."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.core.config import plain_numbers
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import NO_SIGNALS, Array, SignalTable
+from elastic_env.dynamics.biped import Biped
+from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.motion.walk_plan import WalkPlan
+
+STIFFNESS_KEY = "stiffness_nm_per_rad"
+"""Where an identification file holds K."""
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A compiled rigid model and an `ElasticJoint` for each of its elastic hinges, in order.
+
+    The same type describes what the compensators assume and, in `truth()`, what the plant really is.
+    """
+
+    joints: Mapping[str, ElasticJoint]
+    rigid: mujoco.MjModel
+    control_period_s: float
+    observation_table: SignalTable = NO_SIGNALS
+    """What its observation holds, in order."""
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the hinges, in order."""
+        return list(self.joints)
+
+    @property
+    def stiffness(self) -> Array:
+        """K, (n,) [N·m/rad]."""
+        return self._values("stiffness")
+
+    @property
+    def damping(self) -> Array:
+        """D, (n,) [N·m·s/rad]."""
+        return self._values("damping")
+
+    @property
+    def rotor_inertia(self) -> Array:
+        """B, (n,) [kg·m²]."""
+        return self._values("rotor_inertia")
+
+    @property
+    def backlash(self) -> Array:
+        """Width of the dead bands, (n,) [rad]."""
+        return self._values("backlash")
+
+    @property
+    def coulomb_friction(self) -> Array:
+        """Coulomb friction on the links, (n,) [N·m]."""
+        return self._values("coulomb_friction")
+
+    @property
+    def viscous_friction(self) -> Array:
+        """Viscous friction on the links, (n,) [N·m·s/rad]."""
+        return self._values("viscous_friction")
+
+    @property
+    def encoder_counts_per_turn(self) -> int | None:
+        """Counts of the encoders, which are all alike; None for continuous ones."""
+        return next(iter(self.joints.values())).encoder_counts_per_turn
+
+    @property
+    def servos(self) -> tuple[Servo, ...]:
+        """The servos of the joints.
+
+        Raises:
+            ConfigurationError: A joint has no servo.
+        """
+        without = [name for name, joint in self.joints.items() if joint.servo is None]
+        if without:
+            raise ConfigurationError(f"a servo is needed on every joint, but there is none on: {', '.join(without)}")
+        return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
+
+    def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
+        """The same robot with another stiffness, one number for all joints or one per joint [N·m/rad].
+
+        Raises:
+            ConfigurationError: The number of values does not fit, or one is not positive and finite.
+        """
+        return replace(self, joints=with_stiffness(self.joints, stiffness))
+
+    def _values(self, parameter: str) -> Array:
+        return np.array([getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64)
+
+
+def with_stiffness(joints: Mapping[str, ElasticJoint], stiffness: npt.ArrayLike) -> dict[str, ElasticJoint]:
+    """Joints with another stiffness, one number for all or one per joint [N·m/rad].
+
+    Raises:
+        ConfigurationError: The number of values does not fit, or one is not positive and finite.
+    """
+    values = np.asarray(stiffness, dtype=np.float64)
+    if values.shape not in {(), (len(joints),)}:
+        raise ConfigurationError(
+            f"stiffness must be one number or {len(joints)} of them [N·m/rad], one per joint "
+            f"({', '.join(joints)}), got an array of shape {values.shape}"
+        )
+    each = np.broadcast_to(values, (len(joints),))
+    return {name: j.replace(stiffness=float(k)) for (name, j), k in zip(joints.items(), each, strict=True)}
+
+
+@dataclass(frozen=True)
+class WalkerModel(RobotModel):
+    """What is known of a walker: also its legs and the walk that it is to do."""
+
+    biped: Biped = field(kw_only=True)
+    plan: WalkPlan = field(kw_only=True)
+
+
+def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "float | Array":
+    """A stiffness given as a number, as one per joint, or as the file that `elastic identify` writes [N·m/rad].
+
+    Raises:
+        ConfigurationError: The file does not exist or holds no identified stiffness.
+    """
+    given, value = value, plain_numbers(value)
+    if isinstance(value, list | tuple):
+        try:
+            if any(isinstance(item, str | bool) for item in value):  # NumPy would convert them
+                raise TypeError
+            return np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {given!r}") from None
+    if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
+        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {value!r}")
+    try:
+        return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
+    except (TypeError, ValueError):
+        path = Path(value)  # pyright: ignore[reportArgumentType]
+    if not path.is_file():
+        raise ConfigurationError(
+            f"stiffness must be a number [N·m/rad] or an identification file, found no file {path}"
+        )
+    try:
+        return float(json.loads(path.read_text())[STIFFNESS_KEY])
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+        raise ConfigurationError(
+            f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see `elastic identify`"
+        ) from None

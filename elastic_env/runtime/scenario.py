@@ -1,0 +1,141 @@
+"""Named conditions: what the true plant has that the assumed model does not know of.
+
+Two grounds, `ideal` (linear springs, no friction, exact sensors) and `nominal` (the paper's robot: friction, sensor
+noise, encoder counts), and changes on top of either. A change alone is meant on top of `nominal`; `ideal+soft` puts it
+on `ideal`, and changes can be joined: `soft+payload`.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD
+from elastic_env.runtime.sensors import AttitudeSensor
+
+
+class Scenario(Model):
+    """Difference between the true plant and the assumed model, and the quality of the sensors."""
+
+    name: Title = "custom"
+    stiffness_scale: float = quantity("1", 1.0, gt=0, description="true over assumed stiffness of every joint")
+    friction_scale: float = quantity("1", 1.0, ge=0, description="share of the joints' friction that acts, 0 for none")
+    backlash_rad: float = quantity("rad", 0.0, ge=0, description="dead band of every joint, unknown to the compensator")
+    stiffness_spread: float = quantity(
+        "1", 0.0, ge=0, lt=1, description="half-width of a further factor on every joint's stiffness, drawn per robot"
+    )
+    pendulum_mass_scale: float = quantity("1", 1.0, gt=0, description="testbed: true over assumed mass of pendulum")
+    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="walker: mass on the torso, not in the model")
+    push_n: float = quantity("N", 0.0, ge=0, description="walker: force of a push on the torso, anywhere in the walk")
+    push_s: float = quantity("s", 0.1, gt=0, le=600, description="walker: duration of the push")
+    slope_rad: float = quantity("rad", 0.0, ge=0, lt=0.5, description="walker: slope of the floor, direction drawn")
+    encoder_counts: bool = True
+    """Whether the encoders have whole counts."""
+    encoder_bias_rad: float = quantity("rad", 0.0, ge=0, description="half-width of the encoders' homing error")
+    imu: AttitudeSensor = AttitudeSensor()
+    """IMU on the link of the testbed."""
+    pelvis_imu: AttitudeSensor = AttitudeSensor(rate_hz=500.0)
+    """IMU in the pelvis of the walker, the same for roll and pitch."""
+    gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0, description="walker: standard deviation of the gyroscope")
+    force_noise_n: float = quantity("N", 0.0, ge=0, description="walker: standard deviation of the foot forces")
+    moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
+    delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
+
+    @property
+    def draws_robots(self) -> bool:
+        """Whether episodes of the same motion differ in more than noise: joints, offsets of sensors, push or slope."""
+        drawn = (
+            self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.imu.bias_spread_rad,
+            self.pelvis_imu.bias_spread_rad,
+        )  # fmt: skip
+        return any(value > 0.0 for value in drawn)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether episodes of the same motion differ: in what `draws_robots` says, or by noise."""
+        noise = self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm
+        return self.draws_robots or any((*noise, self.imu.is_random, self.pelvis_imu.is_random))
+
+
+_IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
+# the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs at 500 Hz
+_PELVIS_IMU = AttitudeSensor(noise_rad=0.2e-3, rate_hz=500.0)
+# 3DM-GX4-25: 8.73e-5 rad/s/√Hz (KumarRobotics/imu_3dm_gx4) at half the control rate of 250 Hz
+_GYRO_NOISE_RAD_S = 1.0e-3
+# an assumption for the six-axis sensors of the feet, whose data were not found
+_FORCE_NOISE_N, _MOMENT_NOISE_NM = 1.0, 0.05
+# an assumption: homing by hand to about 0.1 degree, and an IMU mounted as accurately
+_HOMING_ERROR_RAD = 2e-3
+
+GROUNDS: dict[str, Scenario] = {
+    "ideal": Scenario(name="ideal", friction_scale=0.0, encoder_counts=False),
+    "nominal": Scenario(
+        name="nominal",
+        imu=_IMU,
+        pelvis_imu=_PELVIS_IMU,
+        gyro_noise_rad_s=_GYRO_NOISE_RAD_S,
+        force_noise_n=_FORCE_NOISE_N,
+        moment_noise_nm=_MOMENT_NOISE_NM,
+    ),
+}
+
+_LONGEST_JOINED = 1000
+"""Characters of a joined name that are looked at."""
+
+Change = Callable[[Scenario], dict[str, Any]]
+
+CHANGES: dict[str, Change] = {
+    "soft": lambda _: {"stiffness_scale": 0.7},
+    "stiff": lambda _: {"stiffness_scale": 1.3},
+    "spread": lambda _: {"stiffness_spread": 0.3},
+    "payload": lambda _: {"pendulum_mass_scale": 1.2, "torso_load_kg": 5.0},
+    "backlash": lambda _: {"backlash_rad": BACKLASH_BOUND_RAD},
+    "sensor": lambda ground: {
+        "encoder_bias_rad": _HOMING_ERROR_RAD,
+        "imu": ground.imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
+        "pelvis_imu": ground.pelvis_imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
+        "delay_steps": 1,
+    },
+    "push": lambda _: {"push_n": 50.0},
+    "slope": lambda _: {"slope_rad": math.radians(1.0)},
+}
+"""Parameters that a change sets on its ground."""
+
+
+WALKER_ONLY = ("spread", "push", "slope")
+"""Changes that the single joint of the testbed does not know."""
+
+
+def scenario_names(testbed: bool = False) -> list[str]:
+    """Names that `make_scenario` accepts, joined names aside; those of the testbed if asked."""
+    return [*GROUNDS, *(name for name in CHANGES if not (testbed and name in WALKER_ONLY))]
+
+
+def make_scenario(name: "str | Scenario", testbed: bool = False) -> Scenario:
+    """The scenario of a name such as "nominal", "soft", "ideal+soft" or "soft+payload".
+
+    Args:
+        name: Name, or the scenario itself.
+        testbed: Whether an unknown name is answered with those of the testbed.
+
+    Raises:
+        ConfigurationError: A part of the name does not exist, a ground stands behind another part, or two changes set
+            the same parameter.
+    """
+    if isinstance(name, Scenario):
+        return name
+    first, *rest = str(name)[:_LONGEST_JOINED].split("+")
+    ground, changes = (GROUNDS[first], rest) if first in GROUNDS else (GROUNDS["nominal"], [first, *rest])
+    parameters: dict[str, Any] = {}
+    for change in changes:
+        if change in GROUNDS:
+            raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
+        if change not in CHANGES:
+            raise unknown_name("scenario", change, scenario_names(testbed))
+        added = CHANGES[change](ground)
+        twice = sorted(parameters.keys() & added.keys())
+        if twice:
+            raise ConfigurationError(f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time")
+        parameters |= added
+    return ground.replace(**parameters, name=str(name))

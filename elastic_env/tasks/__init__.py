@@ -1,1 +1,0 @@
-"""Tasks: what is observed, rewarded and scored."""

@@ -1,1 +1,0 @@
-"""Walking patterns: timing, preview control of the center of mass, leg kinematics."""

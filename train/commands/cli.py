@@ -1,0 +1,109 @@
+"""The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, hardware, demo."""
+
+import contextlib
+import math
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from train.commands.guarding import Bench, Speed
+from train.commands.hardware import Hardware
+from train.commands.learning import Export, Train
+from train.commands.playing import Compare, Demo, Evaluate, Identify, Play
+from train.runs.failures import DEFECT, explained
+
+Command = (
+    Annotated[Identify, tyro.conf.subcommand("identify")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Speed, tyro.conf.subcommand("speed")]
+    | Annotated[Play, tyro.conf.subcommand("play")]
+    | Annotated[Hardware, tyro.conf.subcommand("hardware")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+
+def _with_notes(error: BaseException, said: str | None = None) -> str:
+    """What an error says, and what was noted on its way here."""
+    return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
+
+
+def _told(error: Exception) -> int:
+    """Say what failed; the exit code."""
+    found = explained(error)
+    if found is None:
+        traceback.print_exception(error)
+    said, code = found or (f"this is a defect of elastic-env, please report it: {type(error).__name__}", DEFECT)
+    line = f"[bold red]error:[/] {escape(_with_notes(error, said))}"
+    Console(stderr=True, emoji=False).print(line, highlight=False, soft_wrap=True)
+    return code
+
+
+class _EndedError(KeyboardInterrupt):
+    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
+
+
+_SAME_WISH_S = 2.0
+"""How long a further signal does not interrupt what the first one asked for."""
+
+
+@contextlib.contextmanager
+def _ended_by(*numbers: int) -> Iterator[None]:
+    """Signals that would end this program end what is within by an exception; ignored ones do not."""
+    asked_s = -math.inf
+
+    def end(number: int, _: Any) -> None:
+        nonlocal asked_s
+        now = time.monotonic()
+        if now - asked_s > _SAME_WISH_S:
+            asked_s = now
+            raise _EndedError(number)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in numbers if is_main}
+    taken = {n: handler for n, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)}
+    for number in taken:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the command `elastic`."""
+    if "" not in sys.path and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
+    command: Any = tyro.cli(
+        Command, prog="elastic", args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+        description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
+    )  # fmt: skip
+    with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        try:
+            command.run()
+        except BrokenPipeError:
+            raise  # nobody reads any more: not worth a word
+        except Exception as error:
+            sys.exit(_told(error))
+        except KeyboardInterrupt as error:
+            number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
+            said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+            Console(stderr=True, emoji=False).print(
+                _with_notes(error, said), highlight=False, markup=False, soft_wrap=True
+            )
+            os._exit(128 + number)  # worker processes must not keep the terminal waiting

@@ -1,0 +1,327 @@
+"""Paired changes of a comparison: every residual against its base, and every baseline against the same base."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.signals import Array
+from train.evaluate.environments import Column, Environment, environment
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.families import Origin, origin
+from train.evaluate.statistics import Estimate, change, improvement, over_seeds, pair
+
+CEILING, HELD_OUT, SAME_ROBOT = "ceiling on the training condition", "held out", "trained robot"
+"""Scenario in which nothing is random: training and evaluation see the same; one that training never saw; one whose
+only robot is that of the training, so that evaluation differs by noise alone."""
+FEWEST_SEEDS = 5
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
+misses the truth, over five every eleventh."""
+
+_SMALL = 0.0995
+"""Below it a share is shown with a decimal."""
+_LEAST = 0.005
+"""Below it a bound would look like zero without one."""
+
+Groups = Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A policy against its base in one metric, in one scenario or pooled over a group of them.
+
+    Attributes:
+        policy, base: Titles.
+        is_family: Whether the policy is a residual, so that it has training seeds.
+        reference: Label of the motion.
+        scope: Scenario, or name of the group.
+        is_group: Whether it is a group.
+        swept: Options that a sweep varies, and their values.
+        marks: What the reader has to know of the row: a ceiling, something held out.
+        column: The metric.
+        is_judged: Whether policies are judged by it; else it stands in tables alone.
+        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
+        relative: Interquartile mean of it over training seeds.
+        improvement: Probability that an episode is better than the base's.
+        mine, theirs: Mean metric of the policy and of its base over the pairs [SI].
+        num_pairs: Pairs of training seed and episode.
+        falls, episodes: Failed episodes of the policy, of all of its episodes.
+        base_falls, base_episodes: The same of the base.
+        failure: What failing is called, in the plural.
+    """
+
+    policy: str
+    base: str
+    is_family: bool
+    reference: str
+    scope: str
+    is_group: bool
+    swept: dict[str, float]
+    marks: tuple[str, ...]
+    column: Column
+    is_judged: bool
+    per_seed: Array
+    relative: Estimate
+    improvement: Estimate
+    mine: float
+    theirs: float
+    num_pairs: int
+    falls: int
+    episodes: int
+    base_falls: int
+    base_episodes: int
+    failure: str
+
+    @property
+    def num_seeds(self) -> int:
+        """Training seeds; 0 of a baseline."""
+        return len(self.per_seed) if self.is_family else 0
+
+    @property
+    def num_compared(self) -> int:
+        """Training seeds that have something to compare."""
+        return int(np.isfinite(self.per_seed).sum())
+
+    @property
+    def verdict(self) -> str:
+        """lower, higher, none (the interval includes zero), or unclear (too few training seeds to say)."""
+        low, high = self.relative.low, self.relative.high
+        if low is None or high is None or self.num_compared < FEWEST_SEEDS:
+            return "unclear"
+        return "lower" if high < 0.0 else "higher" if low > 0.0 else "none"
+
+    @property
+    def falls_more(self) -> bool:
+        """Whether the policy fails in a greater share of its episodes than its base."""
+        return self.falls * self.base_episodes > self.base_falls * self.episodes
+
+    @property
+    def falls_less(self) -> bool:
+        """Whether it fails in a smaller share."""
+        return self.falls * self.base_episodes < self.base_falls * self.episodes
+
+    @property
+    def sentence(self) -> str:
+        """What the row shows, and what it does not."""
+        parts = [self._first_words()]
+        missing = len(self.per_seed) - self.num_compared
+        if self.is_family and 0 < missing < self.num_seeds:
+            parts.append(f"{missing} of {self.num_seeds} training seeds have nothing to compare and are not in it")
+        if self.falls_more:
+            parts.append(f"MORE {self.failure.upper()} than {self.base}")
+        elif self.falls_less:
+            parts.append(f"fewer {self.failure} than {self.base}")
+        return "; ".join(parts)
+
+    def _first_words(self) -> str:
+        value = self.relative.value
+        if not np.isfinite(value):
+            where = "in one of the scenarios there is no episode in which" if self.is_group else "in no episode did"
+            return f"nothing to compare: {where} both {'stayed' if self.is_group else 'stay'} up to the end"
+        direction = (
+            "no change"
+            if value == 0.0
+            else f"{percent(abs(value), signed=False)} {'lower' if value < 0.0 else 'higher'}"
+        )
+        if not self.is_family:
+            return f"{direction} (difference of means, no training seeds)"
+        return {
+            "lower": direction,
+            "higher": direction,
+            "none": "the interval includes zero: no difference shown",
+            "unclear": f"{direction} with {self._few_seeds}",
+        }[self.verdict]
+
+    @property
+    def _few_seeds(self) -> str:
+        if self.num_compared == 1:
+            return "one training seed: no interval"
+        return f"{self.num_compared} training seeds: too few to tell it from chance"
+
+
+def percent(value: float, signed: bool = True) -> str:
+    """A share in per cent, with a decimal where it is small; - where there is none."""
+    if not np.isfinite(value):
+        return "-"
+    digits = 1 if 0.0 < abs(value) < _SMALL else 0
+    text = f"{100.0 * value:{'+' if signed else ''}.{digits}f}".replace("-", "−")
+    return f"{text} %"
+
+
+def percent_interval(estimate: Estimate, signed: bool = True) -> str:
+    """A share with its interval, such as −40 % [−45, −33]."""
+    if estimate.low is None or estimate.high is None:
+        return percent(estimate.value, signed)
+    values = estimate.value, estimate.low, estimate.high
+    is_fine = 0.0 < max(map(abs, values)) < _SMALL or any(0.0 < abs(value) < _LEAST for value in values)
+    number = f"{'+' if signed else ''}.{1 if is_fine else 0}f"
+    value, low, high = (f"{100.0 * value:{number}}".replace("-", "−") for value in values)
+    return f"{value} % [{low}, {high}]"
+
+
+def families(evaluations: Sequence[Evaluation]) -> dict[str, Origin]:
+    """Families of residuals by title, with how they were trained."""
+    members: dict[str, dict[str, Evaluation]] = {}
+    for e in evaluations:
+        if e.condition.member is not None:
+            members.setdefault(e.condition.policy.title, {})[e.condition.member.folder] = e
+    return {
+        title: origin([e.condition.member for e in found.values() if e.condition.member is not None])
+        for title, found in members.items()
+    }
+
+
+def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
+    """Cells with the training seeds of a family put together: all of their episodes, the trace of the first."""
+    together: dict[tuple[object, ...], Evaluation] = {}
+    for number, e in enumerate(evaluations):
+        c = e.condition
+        key = (number,) if c.member is None else (c.policy.title, c.reference_name, c.scenario, *_items(c.swept))
+        if key in together:
+            together[key].episodes.extend(e.episodes)
+        else:
+            together[key] = Evaluation(c, list(e.episodes), e.trace, e.points, e.rest_references)
+    return list(together.values())
+
+
+def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
+    """All paired changes: residuals against their bases, baselines against these or, without residuals, the first.
+
+    Args:
+        evaluations: All cells, one per training seed.
+        groups: Scenarios to pool over, by name.
+    """
+    trained = families(evaluations)
+    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
+    bases = {e.condition.policy.title: e.condition.member.base for e in evaluations if e.condition.member}
+    default = list(dict.fromkeys(bases.values())) or titles[:1]
+    rows = []
+    for title in titles:
+        own = [e for e in evaluations if e.condition.policy.title == title]
+        for base in [bases[title]] if title in bases else [base for base in default if base != title]:
+            theirs = [e for e in evaluations if e.condition.policy.title == base]
+            rows += _against(own, theirs, trained.get(title), groups or {})
+    return rows
+
+
+def level(members: Sequence[Evaluation], column: Column) -> Estimate:
+    """Mean of a metric over the episodes that did not fail; of several training seeds the interquartile mean [SI].
+
+    Args:
+        members: One cell, an evaluation per training seed.
+        column: The metric.
+    """
+    values = [e.values(column.metric) for e in members]
+    means = [float(np.mean(some)) if len(some) else float("nan") for some in values]
+    return over_seeds(means) if members[0].condition.member is not None else Estimate(means[0])
+
+
+def by_cell(evaluations: Sequence[Evaluation]) -> dict[tuple[object, ...], list[Evaluation]]:
+    """Evaluations of a policy by reference, scenario and swept values: one per training seed."""
+    cells: dict[tuple[object, ...], list[Evaluation]] = {}
+    for e in evaluations:
+        cells.setdefault((e.condition.reference_name, e.condition.scenario, *_items(e.condition.swept)), []).append(e)
+    return cells
+
+
+def _against(own: Sequence[Evaluation], base: Sequence[Evaluation], trained: Origin | None, groups: Groups
+             ) -> list[Change]:  # fmt: skip
+    """Rows of one policy and one base: every cell, and every group."""
+    mine, theirs = by_cell(own), by_cell(base)
+    cells = {key: (found, theirs.get(key, theirs.get(key[:2], []))) for key, found in mine.items()}
+    cells = {key: both for key, both in cells.items() if both[1]}
+    rows = []
+    for (reference, scenario, *swept), (ours, others) in cells.items():
+        rows += _rows(str(scenario), [(ours, others)], trained, is_group=False)
+        last = [key for key in cells if key[0] == reference and list(key[2:]) == swept][-1]
+        if scenario != last[1]:
+            continue
+        for name, scenarios in groups.items():
+            found = [cells.get((reference, s, *swept)) for s in scenarios]
+            if all(found):
+                rows += _rows(name, [both for both in found if both is not None], trained, is_group=True)
+    return rows
+
+
+def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]], trained: Origin | None, is_group: bool
+          ) -> list[Change]:  # fmt: skip
+    """A row per judged column, over one scenario or several."""
+    first, base = cells[0][0][0].condition, cells[0][1][0].condition
+    scenarios = [ours[0].condition.scenario for ours, _ in cells]
+    known = first.environment
+    mine = [e for ours, _ in cells for e in ours]
+    theirs = [e for _, others in cells for e in others]
+    marks = _marks(trained, _motion(known, first.reference), scenarios, first.swept)
+    rows = []
+    for column in (*known.judged, *known.also):
+        seeds = [
+            [pair(ours[number].episodes, others[0].episodes, column.metric) for ours, others in cells]
+            for number in range(len(cells[0][0]))
+        ]
+        per_seed = np.array([change(pairs) for pairs in seeds])
+        rows.append(
+            Change(
+                policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
+                reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
+                marks=marks, column=column, is_judged=column in known.judged,
+                per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
+                mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
+                theirs=_mean([[p.base for p in pairs] for pairs in seeds]),
+                num_pairs=sum(len(p) for pairs in seeds for p in pairs),
+                falls=sum(e.num_failed for e in mine), episodes=sum(len(e.episodes) for e in mine),
+                base_falls=sum(e.num_failed for e in theirs), base_episodes=sum(len(e.episodes) for e in theirs),
+                failure=known.failures,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _mean(seeds: Sequence[Sequence[Array]]) -> float:
+    """Mean over training seeds, scenarios and episodes, in that order from outside; of those seeds that have all."""
+    means = [np.mean([values.mean() for values in some]) for some in seeds if all(len(values) for values in some)]
+    return float(np.mean(means)) if means else float("nan")
+
+
+def _marks(
+    trained: Origin | None, reference: str, scenarios: Sequence[str], swept: Mapping[str, float]
+) -> tuple[str, ...]:
+    """What training has seen of a row's condition."""
+    if trained is None:
+        return ()
+    if trained.scenarios is None:
+        return ("training condition unknown",)
+    known = environment(trained.environment)
+    motion: Any = known.default_reference if trained.reference is None else trained.reference
+    seen = _motion(known, motion) == reference
+    unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
+    quantity = known.quantity or "reference"
+    if unseen:
+        named = f": {', '.join(unseen)}" if len(unseen) < len(scenarios) else ""
+        return (f"{HELD_OUT}{named}" if seen else f"{HELD_OUT}{named or ' scenario'} and {quantity}",)
+    if not seen:
+        return (f"{HELD_OUT} {quantity}",)
+    if swept:
+        return ()
+    if any(known.is_deterministic(scenario, motion) for scenario in scenarios):
+        return (CEILING,)
+    same = [scenario for scenario in scenarios if known.differs_by_noise_alone(scenario, motion)]
+    named = f": {', '.join(same)}" if len(same) < len(scenarios) else ""
+    return (f"{SAME_ROBOT}{named}",) if same else ()
+
+
+def _motion(known: Environment, reference: Any) -> str:
+    """What of a reference training may have seen: its kind, or its step period whatever the number of steps."""
+    return known.label(known.arguments(reference)[known.motion])
+
+
+def by_line(rows: Sequence[Change]) -> list[list[Change]]:
+    """Changes of the same policy, base and cell together, one per metric."""
+    lines: dict[tuple[object, ...], list[Change]] = {}
+    for row in rows:
+        lines.setdefault((row.policy, row.base, row.reference, row.scope, *_items(row.swept)), []).append(row)
+    return list(lines.values())
+
+
+def _items(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    return tuple(values.items())

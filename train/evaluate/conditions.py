@@ -1,0 +1,123 @@
+"""Cells of a comparison: which policy plays which motion in which environment, as configurations say it."""
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, field_validator
+
+from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
+from elastic_env.core.errors import shown
+from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
+
+MOST_EPISODES = 100_000
+"""Episodes of a cell."""
+
+
+def _options(value: dict[str, Any]) -> dict[str, Any]:
+    motions = {known.motion for known in ENVIRONMENTS.values()}
+    _refuse(value.keys() & {*RESERVED, *motions}, "given here")
+    return value
+
+
+def _reference(value: Any) -> Reference:
+    if isinstance(value, bool) or not isinstance(value, str | int | float | list | tuple | dict):
+        raise ValueError(
+            "a reference is a name, a step period [s], three durations [s] or a mapping of parameters, "
+            f"got {shown(value)}"
+        )
+    if isinstance(value, dict):
+        _refuse(value.keys() & set(RESERVED), "part of a reference")
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _refuse(taken: set[str], what: str) -> None:
+    """Refuse arguments of the environments that stand in the wrong place."""
+    for name in sorted(taken):
+        place = "the commands set it themselves" if name in UNPLACED else "it has a key, or an option, of its own"
+        raise ValueError(f"{name} cannot be {what}; {place}")
+
+
+Motion = Annotated[Any, AfterValidator(_reference)]
+"""A `Reference`, checked when it is read."""
+
+
+class PolicySpec(Model):
+    """A policy of a comparison: a baseline's name, or "FILE.py:function" for one's own, with options."""
+
+    name: Locator
+    label: Locator | None = None
+    """How tables and figures call it; None for its name."""
+    options: dict[str, Any] = {}
+    """Keyword arguments of `baselines.make`, or of one's own function."""
+    env_options: dict[str, Any] = {}
+    """Arguments of the environment for this policy alone, such as form: rigid."""
+    level: bool = False
+    """In a sweep: whether it plays once without the swept option, as a level to compare with."""
+
+    _checked = field_validator("env_options")(_options)
+
+    @property
+    def title(self) -> str:
+        """Label, or name."""
+        return self.label or self.name
+
+
+class Member(Model):
+    """A training seed of a residual, in a comparison that may have more of them."""
+
+    folder: str
+    """Folder of the residual."""
+    training_seed: int | None = None
+    """Seed that it was trained with; None where nothing says it."""
+    base: str
+    """Title of the policy that it corrects."""
+
+
+class Condition(Model):
+    """One cell of a comparison: who plays what under which scenario."""
+
+    env: str = "testbed"
+    policy: PolicySpec
+    member: Member | None = None
+    """Of a residual: which training seed the policy is, and what it corrects."""
+    reference: Motion = "hold"
+    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
+    or a mapping with `step_period` and further arguments of the environment."""
+    label: str | None = None
+    """How tables and figures call the reference; None for what the environment calls it."""
+    scenario: Title = "nominal"
+    env_options: dict[str, Any] = {}
+    """Further arguments of the environment, such as stiffness."""
+    swept: dict[str, float] = {}
+    """The policy's option that a sweep varies, and its value here."""
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
+    seed: int = quantity(
+        "1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode; the next ones follow"
+    )
+
+    _checked = field_validator("env_options")(_options)
+
+    @property
+    def environment(self) -> Environment:
+        """What is known of the environment."""
+        return environment(self.env)
+
+    @property
+    def reference_name(self) -> str:
+        """Label of the reference, or what the environment calls it."""
+        return self.label or self.environment.label(self.reference)
+
+    @property
+    def number(self) -> float | None:
+        """What of the reference scores can be drawn against, such as the step period [s]; None for nothing."""
+        return next(iter(self.environment.abscissa(self.reference).values()), None)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the environment; what the policy says goes before, and what the reference says before that."""
+        motion = self.environment.arguments(self.reference)
+        return {"scenario": self.scenario, **self.env_options, **self.policy.env_options, **motion}
+
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """Options of the policy with the swept one."""
+        return {**self.policy.options, **self.swept}

@@ -1,0 +1,305 @@
+"""What the commands know of each environment: how it is made, what of it is kept, and how its figures are shown."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
+
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.motion.gait import Gait
+from elastic_env.motion.references import make_reference
+from elastic_env.runtime.scenario import make_scenario
+
+Reference: TypeAlias = str | float | list[float] | dict[str, Any]
+"""The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
+
+UNPLACED = ("num_envs", "num_threads", "autoreset_mode", "render_mode")
+"""Arguments of the environments that have no place in a comparison."""
+RESERVED = ("scenario", *UNPLACED)
+"""These, and the argument that has a key of its own."""
+
+_UNITS = {"_rad": ("mrad", 1e3), "_m": ("mm", 1e3), "_s": ("ms", 1e3)}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric in tables and charts.
+
+    Attributes:
+        title: Words for it, short.
+        metric: Name in the record of an episode; its end is the unit.
+        on_console: Whether it is shown where there is little room.
+        decimals: How many are shown.
+        note: What the title leaves open, for the legend; empty where it says it all.
+    """
+
+    title: str
+    metric: str
+    on_console: bool = True
+    decimals: int = 2
+    note: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Unit in which it is shown."""
+        return self._shown[0]
+
+    @property
+    def scale(self) -> float:
+        """Factor from SI to the shown unit."""
+        return self._shown[1]
+
+    @property
+    def label(self) -> str:
+        """Title with unit."""
+        return f"{self.title} [{self.unit}]"
+
+    @property
+    def _shown(self) -> tuple[str, float]:
+        return next(shown for suffix, shown in _UNITS.items() if self.metric.endswith(suffix))
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A traced signal in charts over time.
+
+    Attributes:
+        title: Words for it.
+        name: Its name in the trace.
+        unit: Unit in which it is shown.
+        scale: Factor from SI to that unit.
+        reference: Name of what it should be in the trace; None where that is zero.
+    """
+
+    title: str
+    name: str
+    unit: str
+    scale: float
+    reference: str | None = None
+
+    @property
+    def label(self) -> str:
+        """Title with unit."""
+        return f"{self.title} [{self.unit}]"
+
+
+@dataclass(frozen=True)
+class Environment:
+    """An environment as the commands see it.
+
+    Attributes:
+        id: Its name for `gymnasium.make`.
+        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
+        default_reference: Reference where none is named.
+        arguments: Arguments of `gymnasium.make` for a reference.
+        label: How tables and figures call a reference.
+        draws: Whether episodes of a reference have motions of their own.
+        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where there is nothing.
+        traced: Signals of the first episode that are kept.
+        columns: The summary table.
+        splits: Further tables of the summary, title and columns.
+        subject: What the summary table is about.
+        note: What its reader has to know beside the legend of the columns.
+        figures: Names of the time series to draw, see `train.figures.figures`.
+        overview: Column of the bar chart.
+        swept: Columns drawn against a swept value.
+        learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.
+        judged: Columns that policies are compared by, pair by pair.
+        also: Columns whose paired changes stand in the tables too.
+        curves: Signals over time in the report.
+        quantity: What a reference is, in titles; empty where its label says it.
+        failure: Heading for episodes that end before their time.
+        is_real: Whether it is hardware: one world at a time, in this process, without a truth to score by.
+    """
+
+    id: str
+    motion: str
+    default_reference: Reference
+    arguments: Callable[[Reference], dict[str, Any]]
+    label: Callable[[Reference], str]
+    draws: Callable[[Reference], bool]
+    abscissa: Callable[[Reference], dict[str, float]]
+    traced: tuple[str, ...]
+    columns: tuple[Column, ...]
+    subject: str
+    figures: tuple[str, ...]
+    overview: Column
+    swept: tuple[Column, ...]
+    judged: tuple[Column, ...]
+    curves: tuple[Signal, ...]
+    also: tuple[Column, ...] = ()
+    splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
+    learned_from: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    quantity: str = ""
+    failure: str = "fail"
+    is_real: bool = False
+
+    def is_deterministic(self, scenario: str, reference: Reference) -> bool:
+        """Whether all episodes of a condition are one and the same."""
+        return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
+
+    def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
+        """Whether the episodes of a condition are of one robot and one motion."""
+        return not (self.is_real or make_scenario(scenario).draws_robots or self.draws(reference))
+
+    @property
+    def failures(self) -> str:
+        """What such episodes are called in a sentence."""
+        return "falls" if self.failure == "falls" else "failures"
+
+    def title(self, reference_name: str) -> str:
+        """A reference's name as it stands in titles."""
+        return f"{self.quantity} {reference_name}".strip()
+
+
+_STEPS_OF_THE_PAPER = {"24 s": 2}
+"""Number of steps of the gaits of configs/paper.yaml that have another one than the default."""
+
+
+def environment(name: str) -> Environment:
+    """The environment of a short name.
+
+    Raises:
+        ConfigurationError: It does not exist.
+    """
+    if name not in ENVIRONMENTS:
+        raise unknown_name("environment", name, ENVIRONMENTS)
+    return ENVIRONMENTS[name]
+
+
+def _kind(reference: Reference) -> str:
+    return str(reference.get("kind")) if isinstance(reference, dict) else str(reference)
+
+
+def _is_drawn(reference: Any) -> bool:
+    return make_reference(reference).is_random
+
+
+def _step_period(reference: Reference) -> Any:
+    """Step period of a walker's reference, or its durations [s]."""
+    if not isinstance(reference, dict):
+        return reference
+    if "step_period" not in reference:
+        raise ConfigurationError(
+            f"a reference of the walker that is a mapping needs the key 'step_period', got {reference!r}; "
+            "for example {step_period: 24, num_steps: 2}"
+        )
+    return reference["step_period"]
+
+
+def _walk_arguments(reference: Reference) -> dict[str, Any]:
+    return {**(reference if isinstance(reference, dict) else {}), "step_period": _step_period(reference)}
+
+
+def _walk_label(reference: Reference) -> str:
+    """Step period or durations, and the number of steps where it is not the one that goes without saying."""
+    period = _step_period(reference)
+    parts = period if isinstance(period, list | tuple) else [period]
+    label = "+".join(f"{part:g}" if isinstance(part, int | float) else str(part) for part in parts) + " s"
+    steps = reference.get("num_steps") if isinstance(reference, dict) else None
+    usual = (None, Gait.model_fields["num_steps"].default, _STEPS_OF_THE_PAPER.get(label))
+    return label if steps in usual else f"{label} num_steps={steps}"
+
+
+def _walk_abscissa(reference: Reference) -> dict[str, float]:
+    period = _step_period(reference)
+    parts = period if isinstance(period, list | tuple) else [period]
+    return {"step_period_s": float(f"{sum(map(float, parts)):.6g}")}
+
+
+_TESTBED = Environment(
+    id="elastic_env/Testbed-v0",
+    motion="reference",
+    default_reference="hold",
+    arguments=lambda reference: {"reference": reference},
+    label=_kind,
+    draws=_is_drawn,
+    abscissa=lambda _: {},
+    traced=(
+        "time_s", "reference_angle", "link_angle", "link_angle_imu", "deflection", "link_error", "link_error_imu",
+        "joint_torque",
+    ),
+    columns=(
+        Column("rms", "link_error_rms_rad"),
+        Column("peak", "link_error_peak_rad"),
+        Column("IMU-", "link_error_imu_min_rad", note="least error by the link's IMU"),
+        Column("IMU+", "link_error_imu_max_rad", note="greatest error by it"),
+        Column("est.", "link_estimate_error_rms_rad", note="rms error of the estimated link angle"),
+    ),
+    subject="link error",
+    figures=("time", "static"),
+    overview=Column("link error rms", "link_error_rms_rad"),
+    swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
+    judged=(Column("link error rms", "link_error_rms_rad"),),
+    curves=(
+        Signal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
+        Signal("link error", "link_error", "mrad", 1e3),
+    ),
+)  # fmt: skip
+
+_ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
+
+_WALKER = Environment(
+    id="elastic_env/WalkInPlace-v0",
+    motion="step_period",
+    default_reference=3,
+    arguments=_walk_arguments,
+    label=_walk_label,
+    draws=lambda _: False,
+    abscissa=_walk_abscissa,
+    traced=(
+        "time_s", "pelvis_roll", "pelvis_pitch", "zmp_x", "zmp_y", "zmp_reference_x", "zmp_reference_y",
+        "single_support", "support", "load_share", "force_left", "force_right",
+    ),
+    columns=(
+        _ROLL,
+        Column("roll peak", "pelvis_roll_peak_rad"),
+        Column("pitch rms", "pelvis_pitch_rms_rad"),
+        Column("pitch peak", "pelvis_pitch_peak_rad", on_console=False),
+        _ZMP,
+        Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
+        Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
+        Column("early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"),
+        Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
+        Column("COM jump", "com_jump_mean_m", decimals=1),
+    ),
+    splits=(
+        (
+            "By phase, rms",
+            tuple(
+                Column(f"{title} {phase}", f"{metric}_{phase}_rms_{unit}")
+                for title, metric, unit in (
+                    ("roll", "pelvis_roll", "rad"), ("pitch", "pelvis_pitch", "rad"), ("ZMP", "zmp_deviation", "m"),
+                )
+                for phase in ("double", "single", "transition")
+            ),
+        ),
+    ),
+    subject="pelvis and ZMP of the walk",
+    figures=("pelvis", "zmp"),
+    overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
+    swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    learned_from={"bank": 1},
+    also=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
+    curves=(
+        Signal("pelvis roll", "pelvis_roll", "mrad", 1e3),
+        Signal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
+        Signal("ZMP to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+    ),
+    quantity="step period",
+    failure="falls",
+)  # fmt: skip
+
+_HARDWARE = replace(
+    _TESTBED,
+    id="elastic_env/HardwareTestbed-v0",
+    columns=tuple(column for column in _TESTBED.columns if column.title not in ("est.", "peak")),  # IMU- or IMU+ is it
+    traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
+    subject="link error by the IMU",
+    note="On hardware there is no truth to score an estimate by.",
+    is_real=True,
+)
+
+ENVIRONMENTS = {"testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE}
+"""Environments by the short names of the command line."""

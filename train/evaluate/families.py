@@ -1,0 +1,225 @@
+"""Policies of a comparison with all training seeds of a residual, and with the base that each residual belongs to."""
+
+import difflib
+import fnmatch
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from baselines.policies import RESIDUAL
+from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
+from elastic_env.core.errors import ConfigurationError
+from train.evaluate.conditions import Member, PolicySpec
+from train.evaluate.environments import ENVIRONMENTS
+
+_WILD = re.compile(r"[*?\[]")
+_NEAREST = 5
+"""Names that the error for a pattern without folders lists."""
+_SEED = re.compile(r"seed[_-]?(\d+)")
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """Who plays: a policy, and of a residual which training seed of which family.
+
+    Attributes:
+        policy: The policy; all members of a family have its title.
+        member: Training seed and base; None for what is no residual.
+    """
+
+    policy: PolicySpec
+    member: Member | None = None
+
+
+@dataclass(frozen=True)
+class Origin:
+    """How a family was trained.
+
+    Attributes:
+        scenarios: That it was trained on; None where its files do not say.
+        environment: Short name of the environment.
+        reference: Motion that it was trained on; None for the environment's default.
+        missing_seeds: Training seeds of its configuration that the family does not have.
+        folders: Its folders.
+        commits: Commits that trained it.
+    """
+
+    scenarios: tuple[str, ...] | None
+    environment: str
+    reference: object
+    missing_seeds: tuple[int, ...]
+    folders: tuple[str, ...]
+    commits: tuple[str, ...]
+
+
+def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
+    """All who play: a residual's pattern as one entrant per folder, and bases that nobody named.
+
+    Args:
+        policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
+        with_bases: Whether a base that is not among them is added, before its residual.
+
+    Raises:
+        ConfigurationError: A pattern that matches no folder, a folder without residual, or folders that do not belong
+            together.
+    """
+    entrants: list[Entrant] = []
+    bases = [policy for policy in policies if not is_residual(policy)]
+    for policy in policies:
+        if not is_residual(policy):
+            entrants.append(Entrant(policy))
+            continue
+        members = _members(policy.name.removeprefix(RESIDUAL))
+        for folder, _, said in members:
+            _require_motion(folder, said)
+        description = members[0][2]
+        base = next((known for known in bases if _plays(known, description, policy)), None)
+        if base is None:
+            base = _base(description, policy, [*policies, *bases])
+            if with_bases:
+                bases.append(base)
+                entrants.append(Entrant(base))
+        entrants += [
+            Entrant(
+                policy.replace(name=f"{RESIDUAL}{folder}", label=policy.title),
+                Member(folder=str(folder), training_seed=seed, base=base.title),
+            )
+            for folder, seed, _ in members
+        ]
+    return entrants
+
+
+def is_residual(policy: PolicySpec) -> bool:
+    """Whether a policy is a trained residual, or a family of them."""
+    return policy.name.startswith(RESIDUAL)
+
+
+def origin(members: Sequence[Member]) -> Origin:
+    """How a family was trained, from its files."""
+    descriptions = [read_description(Path(member.folder)) for member in members]
+    config = descriptions[0].origin.config
+    scenarios = config.scenarios
+    wanted, had = set(config.seeds), {member.training_seed for member in members}
+    return Origin(
+        scenarios=None if scenarios is None else tuple(scenarios),
+        environment=descriptions[0].robot,
+        reference=config.reference,
+        missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
+        folders=tuple(member.folder for member in members),
+        commits=tuple(dict.fromkeys(d.origin.commit or "unknown" for d in descriptions)),
+    )
+
+
+def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]:
+    """Folders of a pattern in natural order, with training seed and description; shipped ones where none lie there."""
+    if not _WILD.search(pattern):
+        folder = Path(pattern)
+        description = read_description(folder)
+        return [(folder, _training_seed(folder, description), description)]
+    anchor = Path(pattern).anchor
+    found = [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
+    folders = sorted(found or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
+    if not folders:
+        raise ConfigurationError(f"no folder matches {pattern!r}; {_nearest(Path(pattern))}")
+    members = []
+    for folder in folders:
+        description = read_description(folder)
+        members.append((folder, _training_seed(folder, description), description))
+    _require_one_family(pattern, members)
+    return members
+
+
+def _require_motion(folder: Path, description: ResidualDescription) -> None:
+    """Refuse a residual whose training names a motion that its environment cannot read: the report would need it."""
+    known, reference = ENVIRONMENTS.get(description.robot), description.origin.config.reference
+    if known is None or reference is None:
+        return
+    try:
+        known.label(known.arguments(reference)[known.motion])
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{folder / DESCRIPTION}: training.config.reference: {error}") from None
+
+
+def _nearest(pattern: Path) -> str:
+    """What lies where the folders of a pattern end to exist, the most similar names first, and what is shipped."""
+    there = next(path for path in pattern.parents if path.is_dir() and not _WILD.search(str(path)))
+    names = [path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    near = difflib.get_close_matches(pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0)
+    families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped())
+    where = "this folder" if there == Path() else str(there)
+    return f"{where} has {', '.join(near) or 'no folders'}; with the package come {', '.join(families)}"
+
+
+def _training_seed(folder: Path, description: ResidualDescription) -> int | None:
+    """As the residual says it, or the name of its folder; None where neither does."""
+    if description.origin.seed is not None:
+        return description.origin.seed
+    found = _SEED.findall(str(folder))
+    return int(found[-1]) if found else None
+
+
+def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, ResidualDescription]]) -> None:
+    """Refuse folders that are no training seeds of one configuration."""
+    first, _, expected = members[0]
+    seen: dict[int, Path] = {}
+    for folder, seed, description in members:
+        mine, theirs = _kin(description), _kin(expected)
+        for what in {**mine, **theirs}:
+            if mine.get(what) != theirs.get(what):
+                raise ConfigurationError(
+                    f"{pattern!r} must match training seeds of one configuration, but {what} of {folder} is "
+                    f"{mine.get(what)!r} and of {first} {theirs.get(what)!r}; give each an entry of its own"
+                )
+        if seed is None:
+            raise ConfigurationError(
+                f"{folder} does not say its training seed: residual.json has no training.seed and the path no seed_N"
+            )
+        if seed in seen:
+            raise ConfigurationError(f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and {folder}")
+        seen[seed] = folder
+
+
+_OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_every")
+"""Keys of a training configuration in which the seeds of a family may differ."""
+
+
+def _kin(description: ResidualDescription) -> dict[str, object]:
+    """What the members of a family have in common."""
+    config = description.training.get("config", {})
+    trained = {f"the trained {name}": value for name, value in config.items() if name not in _OWN}
+    return trained | {name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")}
+
+
+def _plays(known: PolicySpec, description: ResidualDescription, residual: PolicySpec) -> bool:
+    """Whether a policy is the base of a residual, with the same options, in the same environment."""
+    return (
+        known.name == description.base
+        and _given(known.options) == _base_options(description, residual)
+        and known.env_options == residual.env_options
+        and known.level == residual.level
+    )
+
+
+def _base(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec:
+    """The base of a residual as a policy of its own, under a title that nobody has."""
+    titles = {policy.title for policy in taken}
+    label = None if description.base not in titles else f"{description.base} (base of {residual.title})"
+    return PolicySpec(
+        name=description.base, label=label, options=_base_options(description, residual),
+        env_options=residual.env_options, level=residual.level,
+    )  # fmt: skip
+
+
+def _base_options(description: ResidualDescription, residual: PolicySpec) -> dict[str, object]:
+    """Options of the base: its own, and over them those that the comparison gives the residual."""
+    return _given({**description.base_options, **residual.options})
+
+
+def _given(options: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Key that sorts seed_2 before seed_10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", str(path))]

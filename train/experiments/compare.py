@@ -1,0 +1,245 @@
+"""Policies × scenarios × references × seeds under one protocol: one tidy CSV, a summary table, figures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, field_validator, model_validator
+from rich.console import Console
+
+from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from train.evaluate.cells import CellsFailedError, run_conditions
+from train.evaluate.changes import changes, merged
+from train.evaluate.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
+from train.evaluate.environments import Environment, Reference, environment
+from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
+from train.evaluate.families import expand
+from train.figures import plots
+from train.figures.figures import draw_figures
+from train.report import Results, require_plotly, write_report
+from train.report.changes_tables import print_changes, write_statistics
+from train.report.summary import print_summary, write_episodes, write_summary
+from train.runs.folders import run_folder
+from train.runs.kinds import is_a
+from train.runs.workers import require_jobs
+
+_MOST_CELLS = 10_000
+
+
+class Sweep(Model):
+    """An option of the policies that takes several values, for curves instead of time series."""
+
+    option: Title
+    """Option of the policies, such as stiffness_scale."""
+    values: list[float] = Field(min_length=2, max_length=MOST_ENTRIES)
+    label: Title | None = None
+    """What the axis says; None for the option's name."""
+
+
+class CompareConfig(Model):
+    """A comparison, as read from `configs/*.yaml`."""
+
+    name: str = Field(pattern=r"^[\w.-]*\w$", max_length=100)
+    """Name of the result folder under runs/: letters, digits, dots, dashes."""
+    env: str = "testbed"
+    references: list[Motion] = Field(min_length=1, max_length=MOST_ENTRIES)
+    """Motions, see `Condition.reference`; default the environment's."""
+    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
+    policies: list[PolicySpec] = Field(
+        default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1, max_length=MOST_ENTRIES
+    )
+    """Baselines by name, or mappings with name, label, options, and env_options of their own."""
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="episodes per cell")
+    scenario_episodes: dict[str, int] = {}
+    """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode")
+    env_options: dict[str, Any] = {}
+    """Further arguments of the environment, such as stiffness."""
+    figure_policies: list[str] = []
+    """Policies that the time series show, by label or name; all if empty."""
+    sweep: Sweep | None = None
+    """An option of the policies to vary."""
+    groups: dict[str, list[str]] = {}
+    """Scenarios that paired changes are also pooled over, by the name of the group."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _environment_has_a_default(cls, values: Any) -> Any:
+        name = values.get("env", "testbed") if isinstance(values, dict) else None
+        return {"references": [environment(name).default_reference], **values} if isinstance(name, str) else values
+
+    _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
+
+    @field_validator("policies", mode="before")
+    @classmethod
+    def _names_are_policies(cls, value: Any) -> Any:
+        return (
+            [{"name": item} if isinstance(item, str) else item for item in value] if isinstance(value, list) else value
+        )
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> Self:
+        environment(self.env)
+        titles = [policy.title for policy in self.policies]
+        for title in titles:
+            if titles.count(title) > 1:
+                raise ConfigurationError(f"two policies are called {title!r}; give one of them a label")
+        if self.sweep is not None and all(policy.level for policy in self.policies):
+            raise ConfigurationError("a sweep needs a policy that it varies; level: true leaves all of them out of it")
+        _require_each_once("reference", self._reference_names())
+        _require_each_once("scenario", self.scenarios)
+        _require_each_once("value of the sweep", self.sweep.values if self.sweep else [])
+        for title in self.figure_policies:
+            if title not in titles:
+                raise unknown_name("policy of the figures", title, titles)
+        for scenario, episodes in self.scenario_episodes.items():
+            if scenario not in self.scenarios:
+                raise unknown_name("scenario with episodes of its own", scenario, self.scenarios)
+            if not 1 <= episodes <= MOST_EPISODES:
+                raise ConfigurationError(
+                    f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got {shown(episodes)}"
+                )
+        for name, scenarios in self.groups.items():
+            if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
+                raise ConfigurationError(
+                    f"group {name!r} must have a name that no scenario has, and scenarios, each once; "
+                    f"got {shown(scenarios)}"
+                )
+            for scenario in scenarios:
+                if scenario not in self.scenarios:
+                    raise unknown_name(f"scenario of the group {name!r}", scenario, self.scenarios)
+        return self
+
+    def conditions(self, with_bases: bool = True) -> list[Condition]:
+        """All cells, in the order reference, scenario, policy, training seed, swept value.
+
+        Args:
+            with_bases: Whether a residual's base that is not among the policies plays too.
+
+        Raises:
+            ConfigurationError: Residuals that do not exist, or are no family.
+        """
+        entrants = expand(self.policies, with_bases)
+        swept = len(self.sweep.values) if self.sweep else 1
+        cells = len(self.references) * len(self.scenarios) * len(entrants) * swept
+        if cells > _MOST_CELLS:
+            raise ConfigurationError(
+                f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)} references x "
+                f"{len(self.scenarios)} scenarios x {len(entrants)} policies x {swept} values are {cells}; split it"
+            )
+        return [
+            Condition(
+                env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
+                scenario=scenario, swept=swept,
+                env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
+                seed=self.seed,
+            )
+            for reference, label in zip(self.references, self._reference_labels(), strict=True)
+            for scenario in self.scenarios
+            for entrant in entrants
+            for swept in self._swept(entrant.policy)
+        ]  # fmt: skip
+
+    def _swept(self, policy: PolicySpec) -> list[dict[str, float]]:
+        if self.sweep is None or policy.level:
+            return [{}]
+        return [{self.sweep.option: value} for value in self.sweep.values]
+
+    def _reference_names(self) -> list[str]:
+        """What tables call the references."""
+        known = environment(self.env)
+        labels = self._reference_labels()
+        return [label or known.label(reference) for label, reference in zip(labels, self.references, strict=True)]
+
+    def _reference_labels(self) -> list[str | None]:
+        """Names that tell references of one kind apart by their parameters; None where the kind is enough."""
+        known = environment(self.env)
+        kinds = [known.label(reference) for reference in self.references]
+        return [
+            " ".join(dict.fromkeys([*kind.split(), *_parameters(reference, known)])) if kinds.count(kind) > 1 else None
+            for kind, reference in zip(kinds, self.references, strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A finished comparison and its files."""
+
+    folder: Path
+    evaluations: list[Evaluation]
+    files: list[Path]
+
+
+def compare(
+    config: CompareConfig, console: Console, output: Path | None = None, jobs: int = 0, report: bool = True
+) -> Comparison:
+    """Run a comparison, write its folder, and print its tables.
+
+    Args:
+        config: What to compare.
+        console: Where progress and table go.
+        output: Folder for the results; default runs/<name>, numbered if taken.
+        jobs: Conditions to run at the same time, 0 for one per core.
+        report: Whether policies are compared with one another, and bases of residuals added for it; else they are
+            scored alone.
+
+    Raises:
+        ConfigurationError: A name or a parameter does not exist; found before the work begins.
+        ResultsExistError: The output folder holds results.
+    """
+    require_jobs(jobs)
+    plots.require_matplotlib()
+    if report:
+        require_plotly()
+    conditions = config.conditions(with_bases=report)
+    try_out(conditions)
+    with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:
+        try:
+            evaluations = run_conditions(conditions, console, jobs)
+        except CellsFailedError as error:
+            if error.finished:
+                write_summary(merged(error.finished), folder / "summary.md")
+                kept = write_episodes(error.finished, folder / "episodes.csv")
+                console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
+            raise
+        files = [write_episodes(evaluations, folder / "episodes.csv")]
+        cells = merged(evaluations)
+        files.append(write_summary(cells, folder / "summary.md"))
+        axis = None if config.sweep is None else config.sweep.label or config.sweep.option
+        files += draw_figures(cells, folder, config.figure_policies, axis)
+        rows = changes(evaluations, config.groups) if report else []
+        if report:
+            files.append(write_statistics(rows, folder / "statistics.csv"))
+            files += write_report(Results(config.name, evaluations, rows, folder, axis))
+    print_summary(cells, console)
+    print_changes(rows, console)
+    return Comparison(folder, evaluations, files)
+
+
+def _require_each_once(what: str, values: Sequence[object]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise ConfigurationError(f"the {what} {shown(value)} stands twice; its episodes would count double")
+
+
+def try_out(conditions: Sequence[Condition]) -> None:
+    """Make environments and policies once, so that a wrong name fails before anything runs."""
+    for condition, env in with_one_world(conditions):
+        try:
+            policy = make_policy(condition.policy, env, condition.policy_options)
+        except ConfigurationError as error:
+            if not condition.swept:
+                raise
+            raise ConfigurationError(f"{error}; level: true leaves a policy out of the sweep") from None
+        if not hasattr(policy, "predict"):
+            raise ConfigurationError(
+                f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
+            )
+
+
+def _parameters(reference: Reference, known: Environment) -> list[str]:
+    if not isinstance(reference, dict):
+        return []
+    return [f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)]

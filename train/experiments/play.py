@@ -1,0 +1,91 @@
+"""Watch a policy: a window, or a video file."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from elastic_env.core.errors import ElasticError, ResultsExistError, missing_extra
+from train.evaluate.conditions import Condition
+from train.evaluate.evaluate import make_policy
+
+_FRAMES_PER_S = 25
+
+
+def play(condition: Condition, console: Console, video: Path | None = None, max_s: float | None = None) -> None:
+    """Play one episode in a window in real time, or into a video file as fast as it goes.
+
+    Args:
+        condition: What to play.
+        console: Where messages go.
+        video: File to write (mp4 or gif); None opens a window.
+        max_s: Stop after this much simulated time [s], one control step at least.
+
+    Raises:
+        ResultsExistError: The video file exists.
+        MissingExtraError: The video writer is not installed.
+    """
+    if max_s is not None and not max_s > 0.0:
+        raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
+    env: Any = gymnasium.make(
+        condition.environment.id, render_mode="human" if video is None else "rgb_array", **condition.arguments
+    )  # fmt: skip
+    task = env.unwrapped.task
+    period = task.assumed_model.control_period_s
+    steps = task.num_steps if max_s is None else max(round(min(max_s / period, task.num_steps)), 1)
+    episode = _episode(env, make_policy(condition.policy, env), condition.seed, steps, console)
+    try:
+        if video is None:
+            _window(episode, period)
+        else:
+            _film(env, episode, steps, period, video, console)
+    finally:
+        env.close()
+
+
+def _episode(env: Any, policy: Any, seed: int, steps: int, console: Console) -> Iterator[int]:
+    """Play step by step; yields the number of each step, and says so where the episode fails."""
+    observation, _ = env.reset(seed=seed)
+    state, start = None, np.array(True)
+    for step in range(steps):
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        observation, _, terminated, truncated, info = env.step(action)
+        start = np.array(False)
+        yield step
+        if terminated:
+            console.print(f"the episode ended after {info['time_s']:.2f} s: {info['termination']}")
+            return
+        if truncated:
+            return
+
+
+def _window(episode: Iterator[int], period: float) -> None:
+    begin = time.perf_counter()
+    for step in episode:
+        time.sleep(max(0.0, begin + (step + 1) * period - time.perf_counter()))
+
+
+def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console) -> None:
+    if video.exists():
+        raise ResultsExistError(f"{video} exists and is not overwritten; name another file")
+    if video.suffix not in {".mp4", ".gif"}:
+        raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")
+    try:
+        import imageio.v2 as imageio
+    except ImportError:
+        raise missing_extra("imageio", "report", "writing a video") from None
+    every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
+    video.parent.mkdir(parents=True, exist_ok=True)
+    writer: Any
+    frame_s = every * period
+    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if video.suffix == ".gif" else {"fps": 1.0 / frame_s}
+    with imageio.get_writer(video, **timing) as writer:
+        for step in track(episode, "filming", total=steps, console=console, transient=True):
+            if step % every == 0:
+                writer.append_data(env.render())
+    console.print(f"wrote {video}")

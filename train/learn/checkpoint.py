@@ -1,0 +1,95 @@
+"""A checkpoint: a folder of files that is written whole or not at all, and read only if it is what was written.
+
+Its files are listed with their SHA-256 digests, which are checked before anything is loaded. A digest tells damage from
+a full disk or a failing one; it is no seal against somebody who writes both.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from elastic_env.core.errors import ElasticError
+
+_DIGESTS = "sha256.json"
+
+
+@contextmanager
+def written(checkpoint: Path) -> Iterator[Path]:
+    """A fresh folder to write files to, which takes the checkpoint's place when all of them are on the disk.
+
+    A kill between its steps loses nothing, once `recovered` has been called; a failure leaves the old checkpoint.
+    """
+    fresh, old = _beside(checkpoint, "new"), _beside(checkpoint, "old")
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    yield fresh
+    digests = {file.name: _digest(file) for file in sorted(fresh.iterdir())}
+    (fresh / _DIGESTS).write_text(json.dumps(digests, indent=2) + "\n", encoding="utf-8")
+    for file in fresh.iterdir():
+        _flush(file)
+    _flush(fresh)
+    shutil.rmtree(old, ignore_errors=True)
+    if checkpoint.exists():
+        checkpoint.rename(old)
+    fresh.rename(checkpoint)
+    _flush(checkpoint.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def recovered(checkpoint: Path) -> bool:
+    """Whether there is a checkpoint, after a kill between the moves of `written` as well."""
+    old = _beside(checkpoint, "old")
+    if not checkpoint.exists() and old.exists():
+        old.rename(checkpoint)
+    return checkpoint.exists()
+
+
+def require_whole(checkpoint: Path) -> None:
+    """Check that the files are those that were written.
+
+    Raises:
+        ElasticError: One is missing, of another content, or not of this checkpoint.
+    """
+    try:
+        digests = json.loads((checkpoint / _DIGESTS).read_text(encoding="utf-8"))
+        found = {file.name: _digest(file) for file in checkpoint.iterdir() if file.name != _DIGESTS}
+    except (OSError, ValueError, RecursionError) as error:
+        raise damaged(checkpoint, f"{_DIGESTS}: {error}") from None
+    if not isinstance(digests, dict):
+        raise damaged(checkpoint, f"{_DIGESTS} is no table of files")
+    for name in sorted(digests.keys() | found.keys()):
+        if name not in found:
+            raise damaged(checkpoint, f"{name} is missing")
+        if name not in digests:
+            raise damaged(checkpoint, f"{name} is not of it")
+        if digests[name] != found[name]:
+            raise damaged(checkpoint, f"the content of {name} is not what was written")
+
+
+def damaged(checkpoint: Path, why: object) -> ElasticError:
+    """The error of a checkpoint that cannot be gone on with."""
+    return ElasticError(
+        f"the checkpoint {checkpoint} is damaged or not whole ({why}); remove it to begin this seed anew"
+    )
+
+
+def _beside(checkpoint: Path, ending: str) -> Path:
+    return checkpoint.with_name(f"{checkpoint.name}.{ending}")
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def _flush(path: Path) -> None:
+    """Have a file or folder on the disk before anything that comes later."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,131 @@
+"""The cheap rival of a learned policy: constant residuals, found by CMA-ES on the same budget of decisions.
+
+Constants know nothing of the phase of the walk nor of any measurement, but there is nothing to explore wrongly. What a
+policy gains over them is what it makes of what it sees.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cmaes import CMA
+
+from baselines.residual.residual import ResidualDescription
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array
+from train.learn.algorithms import options_named
+from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+from train.learn.trainer import Trainer
+
+_DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
+_TOLD = "told.json"
+_FALL_COST = 1e6
+"""Cost of an episode that fails, beyond any sum of rewards: one that ends early also ends its penalties."""
+
+
+class ConstantSearch(Trainer):
+    """One training seed of a search, in a folder of its own.
+
+    All candidates of a generation play the same episodes, as many in every scenario as the worlds allow, and are told
+    the mean sum of rewards; who falls comes behind all who do not. The policy is the mean of the distribution.
+
+    Args:
+        config: What is searched for; its algorithm_options may be population_size and sigma, in residuals.
+        seed: Training seed.
+        folder: Where its files go; one with a checkpoint is gone on with.
+        threads: Threads of the physics, 0 for all cores; the result does not depend on it.
+
+    Raises:
+        ConfigurationError: Names or options that do not exist, or fewer worlds than candidates.
+    """
+
+    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
+        options = {**_DEFAULTS, **config.algorithm_options}
+        if options.keys() != _DEFAULTS.keys():
+            raise unknown_name("option of CMA-ES", (options.keys() - _DEFAULTS.keys()).pop(), _DEFAULTS)
+        super().__init__(config, seed, folder, threads)
+        with options_named(config.algorithm, config.algorithm_options):
+            self._population, sigma = int(options["population_size"]), float(options["sigma"])
+        if self._population < 2 or not sigma > 0.0:
+            raise ConfigurationError(
+                f"CMA-ES needs a population_size >= 2 and a sigma > 0, got {self._population} and {sigma:g}"
+            )
+        episodes = config.worlds // (len(config.scenarios) * self._population)
+        if episodes == 0:
+            needed = len(config.scenarios) * self._population
+            raise ConfigurationError(
+                f"CMA-ES needs a world for each of {self._population} candidates in each scenario, {needed}, "
+                f"got worlds: {config.worlds}"
+            )
+        self._episodes, self._first = episodes, FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
+        shares = [(scenario, episodes * self._population) for scenario in config.scenarios]
+        self._worlds = training_worlds(config, shares, threads)
+        (num_constants,) = self._worlds.single_action_space.shape or (0,)
+        bounds = np.tile([-1.0, 1.0], (num_constants, 1))
+        self._optimiser = CMA(
+            mean=np.zeros(num_constants), sigma=sigma, bounds=bounds, seed=seed,
+            population_size=self._population,
+        )  # fmt: skip
+        self._told: list[list[float]] = []
+        self._done = 0
+        folder.mkdir(parents=True, exist_ok=True)
+        self._go_on()
+
+    @property
+    def done(self) -> int:
+        """Decisions so far."""
+        return self._done
+
+    def _advance(self) -> None:
+        candidates = self._ask()
+        self._tell(candidates, self._play(candidates))
+
+    def _write(self, checkpoint: Path) -> None:
+        """What the search was told: from its seed and that, its state follows."""
+        best = float(self._scores.best) if np.isfinite(self._scores.best) else None
+        told = {"decisions": self.done, "best": best, "told": self._told}
+        (checkpoint / _TOLD).write_text(json.dumps(told), encoding="utf-8")
+
+    def _read(self, checkpoint: Path) -> None:
+        state = json.loads((checkpoint / _TOLD).read_text(encoding="utf-8"))
+        for costs in state["told"]:
+            self._tell(self._ask(), np.array(costs))
+        self._done = state["decisions"]
+        self._scores.best = np.inf if state["best"] is None else state["best"]
+
+    def _ask(self) -> Array:
+        """Candidates of a generation, (population, constants)."""
+        return np.array([self._optimiser.ask() for _ in range(self._population)])
+
+    def _tell(self, candidates: Array, costs: Array) -> None:
+        self._optimiser.tell(list(zip(candidates, costs.tolist(), strict=True)))
+        self._told.append(costs.tolist())
+
+    def _play(self, candidates: Array) -> Array:
+        """Cost of each candidate: minus its mean sum of rewards over an episode, and falls, (population,)."""
+        n, scenarios = self._worlds.num_envs, len(self.config.scenarios)
+        generation = len(self._told)
+        own = self._first + generation * self._episodes + np.arange(self._episodes)
+        self._worlds.reset(seed=np.tile(own, n // self._episodes).tolist())
+        # worlds in the order scenario, candidate, episode
+        residuals = np.tile(np.repeat(candidates, self._episodes, axis=0), (scenarios, 1))
+        total, alive = np.zeros(n), np.ones(n, dtype=np.bool_)
+        while alive.any():
+            _, reward, terminated, truncated, _ = self._worlds.step(residuals)
+            total += np.where(alive, reward - _FALL_COST * terminated, 0.0)
+            self._done += int(alive.sum())
+            alive &= ~(terminated | truncated)
+        return -total.reshape(scenarios, self._population, self._episodes).mean(axis=(0, 2))
+
+    def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
+        """The mean of the distribution as a network whose output does not depend on its input."""
+        constants = self._optimiser.mean
+        (features,) = self._worlds.single_observation_space.shape or (0,)
+        tensors = {
+            "mean": np.zeros(features),
+            "std": np.ones(features),
+            "weight0": np.zeros((len(constants), features), dtype=np.float32),
+            "bias0": constants.astype(np.float32),
+        }
+        return tensors, self.config.description()

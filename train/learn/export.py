@@ -1,0 +1,105 @@
+"""Trained SB3 models as residual folders: weights that a NumPy forward pass reads, without torch."""
+
+import pickle
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces.utils import flatdim
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+
+from baselines.residual.residual import save_residual
+from elastic_env.core.errors import ConfigurationError
+from train.learn.algorithms import algorithm_class
+from train.learn.train_config import TrainConfig, training_worlds
+from train.runs.folders import provenance
+
+Tensors = dict[str, npt.NDArray[Any]]
+
+
+def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, str, Literal["clip", "tanh"]]:
+    """Weights, activation and output of the network that a model acts by deterministically.
+
+    Args:
+        model: With an actor as PPO and A2C have it, or as SAC and TQC have it.
+        normaliser: The `VecNormalize` of its observations; None for none.
+
+    Raises:
+        ConfigurationError: An actor of another kind.
+    """
+    policy: Any = model.policy
+    if hasattr(policy, "mlp_extractor") and hasattr(policy, "action_net"):
+        layers, output = [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
+    elif hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
+        layers, output = [*policy.actor.latent_pi, policy.actor.mu], "tanh"
+    else:
+        raise ConfigurationError(f"a policy of {type(model).__name__} cannot be exported; use PPO, A2C, SAC or TQC")
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    activations = {type(layer) for layer in layers if not isinstance(layer, nn.Linear)}
+    names = {nn.Tanh: "tanh", nn.ReLU: "relu"}
+    if len(activations) != 1 or not activations <= set(names):
+        raise ConfigurationError(f"activations must be all Tanh or all ReLU, got {sorted(map(str, activations))}")
+    tensors: Tensors = {}
+    for i, layer in enumerate(linear):
+        tensors[f"weight{i}"] = layer.weight.detach().cpu().numpy().astype(np.float32)
+        tensors[f"bias{i}"] = layer.bias.detach().cpu().numpy().astype(np.float32)
+    features = tensors["weight0"].shape[1]
+    tensors |= {"mean": np.zeros(features), "std": np.ones(features)}
+    if normaliser is not None:
+        tensors["mean"] = normaliser.obs_rms.mean.copy()
+        tensors["std"] = np.sqrt(normaliser.obs_rms.var + normaliser.epsilon)
+    return tensors, names[activations.pop()], output  # type: ignore[return-value]
+
+
+def _require_fit(tensors: Tensors, config: TrainConfig) -> None:
+    """Compare the widths of a network with what the configuration's residual sees and does."""
+    worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
+    sees, does = flatdim(worlds.single_observation_space), flatdim(worlds.single_action_space)
+    worlds.close()
+    last = max(int(name.removeprefix("bias")) for name in tensors if name.startswith("bias"))
+    given = tensors["weight0"].shape[1], len(tensors[f"bias{last}"])
+    if given != (sees, does):
+        raise ConfigurationError(
+            f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on {config.base} of the "
+            f"{config.env} with these settings sees {sees} and gives {does}"
+        )
+
+
+def export_zip(
+    path: Path, config: TrainConfig, output: Path, normaliser: Path | None = None, trust_pickle: bool = False
+) -> Path:
+    """Turn a model that SB3 saved into a residual folder.
+
+    Args:
+        path: Zip of `model.save`.
+        config: What it was trained on: algorithm, base, settings and clip belong to the policy.
+        output: Folder to write.
+        normaliser: File of `VecNormalize.save`; None where observations were not normalised.
+        trust_pickle: Both are pickles, and loading a pickle runs code from it.
+
+    Raises:
+        ConfigurationError: Pickles that are not trusted, no model, or one that does not fit the configuration.
+    """
+    if not trust_pickle:
+        raise ConfigurationError(
+            f"{path} is a pickle in a zip, and loading it runs code from it; add --trust-pickle if you trust its origin"
+        )
+    for file in (path, normaliser):
+        if file is not None and not file.is_file():
+            raise ConfigurationError(f"no model at {file}")
+    try:
+        model = algorithm_class(config.algorithm).load(path, device="cpu")
+        statistics = None if normaliser is None else pickle.loads(normaliser.read_bytes())
+        tensors, activation, kind = network_of(model, statistics)
+    except ConfigurationError:
+        raise
+    except Exception as error:  # whatever a pickle of something else leads to
+        files = " with ".join(str(file) for file in (path, normaliser) if file is not None)
+        raise ConfigurationError(f"{files} is no model that SB3's {config.algorithm} saved: {error}") from error
+    _require_fit(tensors, config)
+    training = {"config": config.model_dump(mode="json"), **provenance(None), "exported_from": path.name}
+    description = config.description(activation=activation, output=kind, training=training)
+    save_residual(output, description, tensors)
+    return output

@@ -1,0 +1,170 @@
+"""Several vector environments as one: worlds of different scenarios under one policy."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.runtime.task import Task
+from train.evaluate.conditions import Condition
+from train.evaluate.evaluate import make_vector_env
+
+
+class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """The worlds of several vector environments, one environment's after the other's.
+
+    A policy costs hardly more for all of them than for those of one. The environments step side by side on threads,
+    while the physics of one runs without Python: give each one thread of physics, and more to those for which no other
+    is left to step beside. The results do not depend on it.
+
+    Worlds that end are begun anew by who wraps this, with options["reset_mask"].
+
+    Args:
+        envs: Vector environments of ours with `autoreset_mode=DISABLED`, of the same task in different scenarios.
+        num_threads: Environments that step at a time, 0 for as many as there are cores.
+        weights: Factor of each environment's rewards; None for equal ones.
+
+    Raises:
+        ConfigurationError: None, different observations, tasks, motions or assumed joints, another autoreset mode, or
+            not one weight per environment.
+    """
+
+    def __init__(
+        self,
+        envs: Sequence[gymnasium.vector.VectorEnv[Any, Any, Any]],
+        num_threads: int = 0,
+        weights: Sequence[float] | None = None,
+    ) -> None:
+        if not envs:
+            raise ConfigurationError("a mixture needs at least one environment")
+        self.envs: list[Any] = [env.unwrapped for env in envs]
+        for env in self.envs:
+            if env.autoreset_mode is not AutoresetMode.DISABLED:
+                mode = env.autoreset_mode.value
+                raise ConfigurationError(f"all environments of a mixture must have autoreset_mode Disabled, got {mode}")
+            if env.single_observation_space != self.envs[0].single_observation_space:
+                raise ConfigurationError("all environments of a mixture must have the same observation")
+            if (env.task.name, env.task.num_steps) != (self.task.name, self.task.num_steps):
+                raise ConfigurationError("all environments of a mixture must have the same task and motion")
+            if env.assumed_model.joints != self.assumed_model.joints:
+                raise ConfigurationError(
+                    "all environments of a mixture must let a policy assume the same joints: give them the same "
+                    'stiffness, and keep scenarios with "ideal", where no friction is assumed, apart from the others'
+                )
+        factors = [1.0] * len(envs) if weights is None else list(weights)
+        if len(factors) != len(envs):
+            raise ConfigurationError(f"weights must be one per environment, {len(envs)}, got {factors}")
+        self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
+        sizes = [env.num_envs for env in envs]
+        ends = np.cumsum(sizes).tolist()
+        self._worlds = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+        self._weights = np.repeat(factors, sizes)
+        self._weights.flags.writeable = False  # no state
+        self.num_envs = ends[-1]
+        self.autoreset_mode = AutoresetMode.DISABLED
+        self.metadata = {"autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = envs[0].single_observation_space
+        self.single_action_space = envs[0].single_action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def assumed_model(self) -> RobotModel:
+        """What a compensator may know of the robot; the same in all environments."""
+        model: RobotModel = self.envs[0].assumed_model
+        return model
+
+    @property
+    def task(self) -> Task:
+        """The rules of the first environment, whose length and observation are those of all."""
+        task: Task = self.envs[0].task
+        return task
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every world, or in those of options["reset_mask"].
+
+        World i gets seed + i, or the i-th of a list of seeds.
+        """
+        seeds: Any = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        mask: BoolArray = np.ones(self.num_envs, dtype=np.bool_)
+        if options is not None and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+
+        def begun(env: Any, worlds: slice) -> Array:
+            if not mask[worlds].any():
+                return np.asarray(env.task.observe())
+            own = None if seeds is None else list(seeds[worlds])
+            return np.asarray(env.reset(seed=own, options={"reset_mask": mask[worlds]})[0])
+
+        return np.concatenate(self._side_by_side(begun)), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One step in every world; the info is that of worlds that end: `termination` and `episode_metrics`."""
+        results = self._side_by_side(lambda env, worlds: env.step(actions[worlds]))
+        observation, reward, terminated, truncated = (
+            np.concatenate([np.asarray(result[part]) for result in results]) for part in range(4)
+        )
+        ended = terminated | truncated
+        info = self._info([result[4] for result in results], ended) if ended.any() else {}
+        return observation, self._weights * reward, terminated, truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close all environments."""
+        self._threads.shutdown()
+        for env in self.envs:
+            env.close(**kwargs)
+
+    def _side_by_side(self, function: Callable[[Any, slice], Any]) -> list[Any]:
+        if len(self.envs) == 1:  # nothing to wait for in another thread
+            return [function(self.envs[0], self._worlds[0])]
+        return list(self._threads.map(function, self.envs, self._worlds))
+
+    def _info(self, infos: list[dict[str, Any]], ended: BoolArray) -> dict[str, Any]:
+        metrics: dict[str, Array] = {}
+        for info, worlds in zip(infos, self._worlds, strict=True):
+            if ended[worlds].any():
+                for name, values in info["episode_metrics"].items():
+                    whole = metrics.setdefault(name, np.zeros(self.num_envs, dtype=values.dtype))
+                    whole[worlds] = values
+        termination = np.concatenate([info["termination"] for info in infos])
+        return {"termination": termination, "episode_metrics": metrics, "_episode_metrics": ended}
+
+
+def mixed_env(
+    conditions: Sequence[Condition], sizes: Sequence[int], num_threads: int = 0, weights: Sequence[float] | None = None
+) -> MixedVectorEnv:
+    """Worlds of several conditions.
+
+    Args:
+        conditions: Cells of one environment and motion; their policies are not used.
+        sizes: Worlds of each.
+        num_threads: Threads of the physics, 0 for as many as there are cores.
+        weights: Factor of each one's rewards; None for equal ones.
+
+    Raises:
+        ConfigurationError: A name or an option that does not exist.
+    """
+    threads = threads_of_each(_cores(num_threads), len(conditions))
+    envs = [
+        make_vector_env(condition, size, own, AutoresetMode.DISABLED)
+        for condition, size, own in zip(conditions, sizes, threads, strict=True)
+    ]
+    return MixedVectorEnv(envs, num_threads, weights)
+
+
+def _cores(num_threads: int) -> int:
+    return num_threads or os.cpu_count() or 1
+
+
+def threads_of_each(cores: int, count: int) -> list[int]:
+    """Threads of environments that step side by side: one each, and the last ones share what they leave idle."""
+    last = count % cores
+    return [1] * (count - last) + [cores // max(last, 1)] * last

@@ -1,0 +1,108 @@
+"""Our vector environments for Stable-Baselines3: arrays in, arrays out, no Python loop over worlds."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from elastic_env.core.errors import ConfigurationError
+
+_NOTHING: dict[str, Any] = {}
+
+
+class SB3VecEnv(VecEnv):
+    """A Gymnasium vector environment with same-step autoreset as an SB3 `VecEnv`.
+
+    Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`: reward r, length l in
+    steps of this environment, and the metrics of the task) are in the infos of the worlds that end, as SB3 reads them.
+
+    Args:
+        env: With `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
+        stagger: Generator for an order in which first episodes end early, see `ResidualVectorWrapper.stagger`; None to
+            let all worlds go on in step.
+
+    Raises:
+        ConfigurationError: Another autoreset mode.
+    """
+
+    def __init__(
+        self, env: gymnasium.vector.VectorEnv[Any, Any, Any], stagger: np.random.Generator | None = None
+    ) -> None:
+        mode = env.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            raise ConfigurationError(
+                f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
+            )
+        self.env, self._stagger = env, stagger
+        self._actions: Any = None
+        self._reward, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> Any:
+        """Begin an episode in every world, with the seeds of the last call of `seed`."""
+        seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        observation, _ = self.env.reset(seed=seeds)
+        if self._stagger is not None:
+            self.env.stagger(self._stagger)  # type: ignore[attr-defined]
+        self._reset_seeds()
+        self._reset_options()
+        self._reward[:], self._length[:] = 0.0, 0
+        return observation
+
+    def step_async(self, actions: Any) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, Any, Any, Any]:
+        """One step in every world."""
+        observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        done = terminated | truncated
+        self._reward += reward
+        self._length += 1
+        # worlds that go on share an empty info: SB3 only reads those that end
+        infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
+        if done.any():
+            final = info["final_info"]
+            metrics, scored = final.get("episode_metrics", {}), final.get("_episode_metrics", done)
+            for world in np.flatnonzero(done).tolist():
+                infos[world] = {
+                    "terminal_observation": info["final_obs"][world],
+                    "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
+                    "episode": {"r": float(self._reward[world]), "l": int(self._length[world]), "t": 0.0},
+                    "episode_metrics": {
+                        name: values[world].item() for name, values in metrics.items() if scored[world]
+                    },
+                }
+            self._reward[done], self._length[done] = 0.0, 0
+        return observation, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the vector environment, once per world."""
+        value = getattr(self.env, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Worlds have no attributes of their own."""
+        raise NotImplementedError("the worlds of a vector environment have no attributes of their own")
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method of the vector environment once, and return its result for every world."""
+        result = getattr(self.env, method_name)(*args, **kwargs)
+        return [result for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Worlds are not wrapped one by one; this environment keeps episode statistics, as a Monitor does."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[Any]:
+        """Vector environments are not rendered."""
+        return [None for _ in range(self.num_envs)]

@@ -1,0 +1,138 @@
+"""A training on its way: scores against the base on episodes that it never learns from, best and last policy."""
+
+import csv
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.residual.residual import ResidualDescription, save_residual
+from elastic_env.core.signals import Array, BoolArray
+from train.evaluate.conditions import Condition
+from train.evaluate.environments import environment
+from train.evaluate.evaluate import make_policy
+from train.evaluate.progress import PROGRESS
+from train.learn.mixed_env import mixed_env
+from train.learn.train_config import TrainConfig
+from train.runs.folders import provenance
+
+
+class Scores:
+    """Evaluations and policies of a training seed.
+
+    Args:
+        config: What is trained.
+        seed: Training seed.
+        folder: Of the seed; `progress.csv`, `best/` and `last/` go there.
+        threads: Threads of the physics, 0 for all cores.
+    """
+
+    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
+        self._config, self._folder, self._threads = config, folder, threads
+        self._provenance = provenance(seed)
+        self._base_scores: list[tuple[list[float], int]] | None = None
+        self.best = np.inf
+        """Score of the best policy so far: mean ratio to the base, and what falls cost."""
+
+    def evaluate(self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> None:
+        """Score a policy after some decisions, and keep it where it is the best so far.
+
+        A residual begins as its base, within a hundredth of its range: before the first decision the base's score
+        is its own.
+        """
+        current = self.keep("current", decisions, policy)
+        columns = [column.metric for column in environment(self._config.env).judged]
+        if self._base_scores is None:
+            self._base_scores = self._played(self._config.base, columns)
+        scores = self._base_scores if decisions == 0 else self._played(f"residual:{current}", columns)
+        table, ratios = [], []
+        for scenario, (mine, falls), (base, base_falls) in zip(
+            self._config.scenarios, scores, self._base_scores, strict=True
+        ):
+            table.append([decisions, scenario, *mine, *base, falls, base_falls])
+            ratios.append(np.nan_to_num(np.array(mine) / base, nan=10.0).mean() + falls)
+        header = ["decisions", "scenario", *columns, *(f"base_{name}" for name in columns), "failed", "base_failed"]
+        _append(self._folder / PROGRESS, header, table)
+        score = float(np.mean(ratios))
+        if score < self.best:
+            self.best = score
+            self.keep("best", decisions, policy)
+        shutil.rmtree(current)
+
+    def keep(self, name: str, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> Path:
+        """Write a policy as a folder, replacing the one of that name."""
+        tensors, description = policy
+        training = {"config": self._config.model_dump(mode="json"), "decisions": decisions, **self._provenance}
+        fresh = self._folder / f"{name}.new"
+        shutil.rmtree(fresh, ignore_errors=True)
+        save_residual(fresh, description.replace(training=training), tensors)
+        shutil.rmtree(self._folder / name, ignore_errors=True)
+        return fresh.rename(self._folder / name)
+
+    def forget_after(self, decisions: int) -> None:
+        """Drop evaluations that were made after the checkpoint that is gone on with; they will be made again."""
+        path, fresh = self._folder / PROGRESS, self._folder / f"{PROGRESS}.new"
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        kept = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",")[0]) <= decisions]
+        if decisions == 0 or not lines:
+            path.unlink(missing_ok=True)
+            return
+        fresh.write_text("".join([lines[0], *kept]))
+        fresh.replace(path)
+
+    def _played(self, policy: str, metrics: list[str]) -> list[tuple[list[float], int]]:
+        """For each scenario means of metrics over the episodes that did not fail, and how many did."""
+        conditions = [self._config.condition(scenario, policy) for scenario in self._config.scenarios]
+        results = played_together(conditions, metrics, self._threads)
+        return [
+            ([float(np.mean(some)) if len(some) else np.nan for some in result[~failed].T], int(failed.sum()))
+            for result, failed in results
+        ]
+
+
+def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
+    is_new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")  # as `Scores.forget_after` leaves it
+        if is_new:
+            writer.writerow(header)
+        writer.writerows(rows)
+
+
+def played_together(
+    conditions: Sequence[Condition], metrics: Sequence[str], num_threads: int = 0
+) -> list[tuple[Array, BoolArray]]:
+    """Play the episodes of several conditions at once: the scores of `evaluate`, without its time series.
+
+    Args:
+        conditions: Cells of one environment, motion and policy.
+        metrics: Names of scores.
+        num_threads: Threads, 0 for all cores.
+
+    Returns:
+        For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
+    """
+    sizes = [condition.episodes for condition in conditions]
+    worlds = mixed_env(conditions, sizes, num_threads)
+    try:
+        policy = make_policy(conditions[0].policy, worlds)
+        seeds = [condition.seed + episode for condition in conditions for episode in range(condition.episodes)]
+        values, failed = np.full((len(seeds), len(metrics)), np.nan), np.zeros(len(seeds), dtype=np.bool_)
+        observation, _ = worlds.reset(seed=seeds)
+        state, starting, playing = None, np.ones_like(failed), np.ones_like(failed)
+        while playing.any():
+            action, state = policy.predict(observation, state=state, episode_start=starting, deterministic=True)
+            observation, _, terminated, truncated, info = worlds.step(action)
+            starting = terminated | truncated
+            if starting.any():
+                scores = np.stack([info["episode_metrics"][name] for name in metrics], axis=1)
+                first = playing & starting
+                values[first], failed[first] = scores[first], terminated[first]
+                playing &= ~starting
+                observation, _ = worlds.reset(options={"reset_mask": starting})
+    finally:
+        worlds.close()
+    parts = np.cumsum(sizes)[:-1]
+    return list(zip(np.split(values, parts), np.split(failed, parts), strict=True))

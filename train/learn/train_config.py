@@ -1,0 +1,170 @@
+"""What is trained on what: the configuration of a training, and the worlds that it learns from."""
+
+import os
+from typing import Annotated, Any, Self
+
+from gymnasium.vector import AutoresetMode
+from pydantic import Field, field_validator, model_validator
+
+import baselines
+from baselines.residual.correction import ResidualSettings
+from baselines.residual.residual import ResidualDescription, require_plain_base
+from baselines.residual_env import ResidualVectorWrapper
+from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, shown
+from train.evaluate.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
+from train.evaluate.environments import environment
+from train.learn.mixed_env import mixed_env
+from train.runs.kinds import is_a
+
+FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
+"""Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""
+CONSTANTS = "CMA-ES"
+"""Algorithm that searches constants instead of training a network."""
+TRAINING_SEED_STRIDE = 100_000
+"""Distance of the episodes of two training seeds."""
+
+
+_MOST_DECISIONS = 10**12
+
+
+class TrainConfig(Model):
+    """What is trained on what."""
+
+    name: Title = "train"
+    env: str = "walker"
+    reference: Motion | None = None
+    """Motion, as in a comparison; None for the environment's default."""
+    scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
+    """Scenarios whose worlds are learned from together, in equal shares."""
+    weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = {}
+    """How much the rewards of single scenarios count; 1 where nothing is said."""
+    env_options: dict[str, Any] = {}
+    """Further arguments of the environment, such as the weights of its reward."""
+    base: Title = "input_output"
+    """Policy that is corrected: a baseline by name, since an exported residual plays without code of its own."""
+    base_options: dict[str, Any] = {}
+    settings: ResidualSettings = ResidualSettings()
+    """How the residual acts and what it sees."""
+    algorithm: Locator = "PPO"
+    """Class of stable_baselines3, "module:Class" of one that has the same interface, or "CMA-ES", a search over
+    residuals that never change."""
+    algorithm_options: dict[str, Any] = {}
+    """Its keyword arguments, over the defaults."""
+    anneal: bool = False
+    """Whether the learning rate falls linearly to zero over the decisions."""
+    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
+    worlds: int = quantity("1", 64, ge=2, le=10_000_000, description="worlds, shared out to the scenarios")
+    decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS, description="decisions of all worlds together")
+    seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1, max_length=MOST_ENTRIES)
+    """Training seeds, each a run of its own."""
+    evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS, description="decisions between evaluations")
+    evaluation_episodes: int = quantity(
+        "1", 4, ge=1, le=MOST_EPISODES, description="episodes per scenario in an evaluation"
+    )
+    checkpoint_every: int = quantity("1", 10_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
+
+    _kind = model_validator(mode="before")(is_a("training"))
+    _checked = field_validator("base")(require_plain_base)
+
+    @model_validator(mode="after")
+    def _weights_are_of_scenarios(self) -> Self:
+        for name in self.weights:
+            if name not in self.scenarios:
+                raise ValueError(
+                    f"weights must be of scenarios that are learned from, {shown(self.scenarios)}, got {shown(name)}"
+                )
+        return self
+
+    @field_validator("algorithm_options")
+    @classmethod
+    def _policy_arguments_are_a_mapping(cls, options: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(options.get("policy_kwargs"), dict | None):
+            raise ValueError(f"policy_kwargs must be a mapping, got {shown(options['policy_kwargs'])}")
+        return options
+
+    @field_validator("seeds")
+    @classmethod
+    def _each_seed_once(cls, seeds: list[int]) -> list[int]:
+        if len(set(seeds)) < len(seeds):
+            raise ValueError(f"every training seed has a folder of its own and can stand but once, got {shown(seeds)}")
+        return seeds
+
+    @property
+    def motion(self) -> Any:
+        """The reference, or the environment's default."""
+        return environment(self.env).default_reference if self.reference is None else self.reference
+
+    def condition(self, scenario: str, policy: str) -> Condition:
+        """A cell in which a policy is evaluated on the way; where nothing is drawn, one episode is all there is."""
+        is_one = environment(self.env).is_deterministic(scenario, self.motion)
+        return Condition(
+            env=self.env,
+            policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
+            scenario=scenario,
+            reference=self.motion,
+            env_options=self.env_options,
+            episodes=1 if is_one else self.evaluation_episodes,
+            seed=EVALUATION_SEED,
+        )
+
+    def description(self, **network: Any) -> ResidualDescription:
+        """What an exported policy says of itself; `network` names its activation and output."""
+        return ResidualDescription(
+            robot=self.env, base=self.base, base_options=self.base_options, settings=self.settings, clip=self.clip,
+            **network,
+        )  # fmt: skip
+
+    def is_due(self, every: int, before: int, now: int) -> bool:
+        """Whether something that is done every so many decisions, and at the end, is due between two counts of them."""
+        return now // every > before // every or now >= self.decisions
+
+    @property
+    def shares(self) -> list[tuple[str, int]]:
+        """Worlds of each scenario; the first ones take what does not divide.
+
+        Raises:
+            ConfigurationError: Fewer than two for one of them.
+        """
+        count = len(self.scenarios)
+        if self.worlds < 2 * count:
+            raise ConfigurationError(f"worlds must be at least two per scenario, {2 * count}, got {self.worlds}")
+        whole, rest = divmod(self.worlds, count)
+        return [(scenario, whole + (i < rest)) for i, scenario in enumerate(self.scenarios)]
+
+
+_WORLD_BYTES = 100_000
+"""Memory of a world: measured on the walker with its policy, and on the testbed with a motion of its own."""
+
+
+def _require_memory(worlds: int) -> None:
+    needed, there = worlds * _WORLD_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ConfigurationError(
+            f"{worlds} worlds take about {needed / 1e9:.1f} GB of memory, this computer has {there / 1e9:.1f} GB; "
+            f"set worlds to at most {there // _WORLD_BYTES}"
+        )
+
+
+def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> ResidualVectorWrapper:
+    """Worlds under residuals of the configuration's base.
+
+    Args:
+        config: What is trained.
+        shares: How many worlds of which scenario.
+        threads: Threads of the physics, 0 for all cores; the results do not depend on it.
+
+    Raises:
+        ConfigurationError: A name or an option that does not exist.
+    """
+    _require_memory(sum(count for _, count in shares))
+    conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
+    apart = {**environment(config.env).learned_from, **config.env_options}
+    worlds = mixed_env(
+        [condition.replace(env_options=apart) for condition in conditions],
+        [count for _, count in shares],
+        threads,
+        [config.weights.get(scenario, 1.0) for scenario, _ in shares],
+    )
+    base = baselines.make(config.base, worlds, **config.base_options)
+    return ResidualVectorWrapper(worlds, base, autoreset_mode=AutoresetMode.SAME_STEP, **config.settings.model_dump())

@@ -1,0 +1,247 @@
+"""Training of residuals with Stable-Baselines3, and checkpoints of all that it depends on.
+
+A run is a folder per training seed: `checkpoint/` to go on from, `best/` and `last/` as policies that need no torch,
+`progress.csv`, and TensorBoard's files. Training is deterministic on one thread; a run that is interrupted or killed
+and resumed ends with the same weights, bit for bit, as one that was not.
+"""
+
+import io
+import random
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecNormalize
+
+from baselines.residual.residual import ResidualDescription
+from train.learn.algorithms import algorithm_class, options_named
+from train.learn.export import network_of
+from train.learn.sb3_env import SB3VecEnv
+from train.learn.state import capture, read_state, restore, write_state
+from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+from train.learn.trainer import Trainer
+
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "PPO": {
+        "n_steps": 32, "batch_size": 512, "n_epochs": 10, "gamma": 0.95, "learning_rate": 5e-4,
+        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0},
+    },
+    "SAC": {
+        "gamma": 0.95, "learning_rate": 5e-4, "batch_size": 512, "buffer_size": 200_000, "learning_starts": 2_000,
+        "train_freq": 4, "gradient_steps": 8, "policy_kwargs": {"net_arch": {"pi": [64, 64], "qf": [256, 256]}},
+    },
+}  # fmt: skip
+_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+class Training(Trainer):
+    """One training seed of a configuration, in a folder of its own.
+
+    Args:
+        config: What is trained.
+        seed: Training seed.
+        folder: Where its files go; one with a checkpoint is gone on with.
+        threads: Threads of the physics, 0 for all cores; the weights do not depend on it.
+
+    Raises:
+        ConfigurationError: Names or options that do not exist.
+    """
+
+    def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
+        torch.set_num_threads(1)  # more would fight the threads of the physics
+        torch.use_deterministic_algorithms(True)
+        super().__init__(config, seed, folder, threads)
+        self._worlds = SB3VecEnv(training_worlds(config, config.shares, threads), np.random.default_rng(seed))
+        options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
+        gamma = options.get("gamma", 0.99)
+        self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
+        set_random_seed(seed)
+        self._normaliser.seed(FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed)
+        algorithm = algorithm_class(config.algorithm)
+        with options_named(config.algorithm, config.algorithm_options):
+            self.model: Any = algorithm("MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options))
+            self._learning_rate = float(self.model.lr_schedule(1.0))
+            self._shrink_last_layer()
+        self.model.action_space.seed(seed)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
+        self._go_on()
+
+    def run(self, progress: Callable[[int], None] | None = None) -> None:
+        """See `Trainer`; what TensorBoard's thread could not write, such as to a full disk, is raised here."""
+        with _thread_raises_here():
+            super().run(progress)
+            self.model.logger.close()
+
+    @property
+    def done(self) -> int:
+        """Decisions so far."""
+        return int(self.model.num_timesteps)
+
+    def _advance(self) -> None:
+        before = self.done
+        if self.config.anneal:
+            rate = self._learning_rate * (1.0 - before / self.config.decisions)
+            self.model.lr_schedule = lambda _: rate
+        self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=1)
+
+    def _write(self, checkpoint: Path) -> None:
+        parameters = io.BytesIO()  # torch itself calls a full disk an internal error
+        torch.save(self._parameters(), parameters)
+        (checkpoint / "model.pt").write_bytes(parameters.getbuffer())
+        write_state(checkpoint, "state", self._state())
+
+    def _read(self, checkpoint: Path) -> None:
+        parameters = torch.load(checkpoint / "model.pt", weights_only=True)
+        self.model.policy.load_state_dict(parameters["policy"])
+        for name, optimiser in self._optimisers().items():
+            optimiser.load_state_dict(parameters["optimisers"][name])
+        if "log_ent_coef" in parameters:
+            self.model.log_ent_coef.data.copy_(parameters["log_ent_coef"])
+        torch.set_rng_state(parameters["rng"])
+        self._load(read_state(checkpoint, "state"))
+
+    def _parameters(self) -> dict[str, Any]:
+        parameters = {
+            "policy": self.model.policy.state_dict(),
+            "optimisers": {name: optimiser.state_dict() for name, optimiser in self._optimisers().items()},
+            "rng": torch.get_rng_state(),
+        }
+        if getattr(self.model, "log_ent_coef", None) is not None:
+            parameters["log_ent_coef"] = self.model.log_ent_coef.detach()
+        return parameters
+
+    def _optimisers(self) -> dict[str, Any]:
+        policy = self.model.policy
+        found = {
+            "policy": getattr(policy, "optimizer", None),
+            "actor": getattr(getattr(policy, "actor", None), "optimizer", None),
+            "critic": getattr(getattr(policy, "critic", None), "optimizer", None),
+            "entropy": getattr(self.model, "ent_coef_optimizer", None),
+        }
+        return {name: optimiser for name, optimiser in found.items() if optimiser is not None}
+
+    def _state(self) -> dict[str, Any]:
+        model, normaliser = self.model, self._normaliser
+        statistics: dict[str, Any] = {"observation": normaliser.obs_rms, "return": normaliser.ret_rms}
+        numpy_state: Any = np.random.get_state()  # noqa: NPY002  the generator that SB3 shuffles with
+        state = {
+            "decisions": model.num_timesteps,
+            "updates": model._n_updates,
+            "episodes": model._episode_num,
+            "best": float(self._scores.best) if np.isfinite(self._scores.best) else None,
+            "observation": model._last_obs,
+            "original": model._last_original_obs,
+            "starts": model._last_episode_starts,
+            "normaliser": {name: [rms.mean, rms.var, float(rms.count)] for name, rms in statistics.items()},
+            "returns": normaliser.returns,
+            "old_observation": normaliser.old_obs,
+            "old_reward": normaliser.old_reward,
+            "numpy": [numpy_state[0], numpy_state[1], *numpy_state[2:]],
+            "python": _listed(random.getstate()),
+            "actions": capture(model.action_space.np_random),
+            "worlds": capture(self._worlds),
+        }
+        if isinstance(model, OffPolicyAlgorithm):
+            buffer = model.replay_buffer
+            names = [name for name in _REPLAY if hasattr(buffer, name)]
+            size = buffer.buffer_size if buffer.full else buffer.pos  # type: ignore[union-attr]
+            state["replay"] = {name: getattr(buffer, name)[:size] for name in names}
+            state["replay_at"] = [buffer.pos, bool(buffer.full)]  # type: ignore[union-attr]
+        return state
+
+    def _load(self, state: dict[str, Any]) -> None:
+        model, normaliser = self.model, self._normaliser
+        model.num_timesteps, model._n_updates = state["decisions"], state["updates"]
+        model._episode_num = state["episodes"]
+        self._scores.best = np.inf if state["best"] is None else state["best"]
+        model._last_obs, model._last_original_obs = state["observation"], state["original"]
+        model._last_episode_starts = state["starts"]
+        rms: Any
+        for name, rms in (("observation", normaliser.obs_rms), ("return", normaliser.ret_rms)):
+            mean, var, count = state["normaliser"][name]
+            rms.mean, rms.var, rms.count = mean, var, count
+        normaliser.returns = state["returns"]
+        normaliser.old_obs, normaliser.old_reward = state["old_observation"], state["old_reward"]
+        np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
+        random.setstate(_tupled(state["python"]))
+        restore(model.action_space.np_random, state["actions"])
+        restore(self._worlds, state["worlds"])
+        if model.ep_info_buffer is None:
+            model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
+        if isinstance(model, OffPolicyAlgorithm):
+            buffer: Any = model.replay_buffer
+            for name, values in state["replay"].items():
+                getattr(buffer, name)[: len(values)] = values
+            buffer.pos, buffer.full = state["replay_at"]
+
+    def _portion(self) -> int:
+        """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on to its next update."""
+        is_off_policy = isinstance(self.model, OffPolicyAlgorithm)  # whose n_steps are those of its returns
+        return self.config.worlds * (1 if is_off_policy else self.model.n_steps)
+
+    def _shrink_last_layer(self) -> None:
+        """A residual begins near zero: as the base."""
+        policy = self.model.policy
+        layer = policy.action_net if hasattr(policy, "action_net") else policy.actor.mu
+        with torch.no_grad():
+            layer.weight.mul_(0.01)
+            layer.bias.zero_()
+
+    def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
+        """The present policy, as it is exported."""
+        tensors, activation, output = network_of(self.model, self._normaliser)
+        return tensors, self.config.description(activation=activation, output=output)
+
+    def _evaluate(self) -> None:
+        """Score the present policy, without a trace in the random states of the training."""
+        states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+        super()._evaluate()
+        torch.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+
+
+@contextmanager
+def _thread_raises_here() -> Iterator[None]:
+    """Keep TensorBoard's thread from printing the error that its next call raises in this one."""
+    before = threading.excepthook
+
+    def print_others(error: threading.ExceptHookArgs) -> None:
+        if getattr(error.thread, "exception", None) is not error.exc_value:
+            before(error)
+
+    threading.excepthook = print_others
+    try:
+        yield
+    finally:
+        threading.excepthook = before
+
+
+def _merged(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    policy = {**defaults.get("policy_kwargs", {}), **(given.get("policy_kwargs") or {})}
+    return {**defaults, **given, **({"policy_kwargs": policy} if policy else {})}
+
+
+def _resolved(options: dict[str, Any]) -> dict[str, Any]:
+    """Options with the activation's class in the place of its name."""
+    policy = dict(options.get("policy_kwargs") or {})
+    if isinstance(policy.get("activation_fn"), str):
+        policy["activation_fn"] = getattr(torch.nn, policy["activation_fn"])
+    return {**options, "policy_kwargs": policy}
+
+
+def _listed(value: Any) -> Any:
+    return [_listed(part) for part in value] if isinstance(value, tuple) else value
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(_tupled(part) for part in value) if isinstance(value, list) else value

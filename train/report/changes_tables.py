@@ -1,0 +1,120 @@
+"""Paired changes as a table for the terminal and as CSV."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from train.evaluate.changes import CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
+from train.evaluate.statistics import Estimate
+from train.runs.escaping import csv_row
+
+
+def write_statistics(rows: Sequence[Change], path: Path) -> Path:
+    """One row per change; metrics in SI units, changes and probabilities as shares of one."""
+    swept = list(dict.fromkeys(name for row in rows for name in row.swept))
+    records = [_record(row, swept) for row in rows]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*_HEAD, *swept, *_FIGURES])
+        writer.writerows(map(csv_row, records))
+    return path
+
+
+_HEAD = ("policy", "base", "kind", "reference", "scope", "pooled", "marks")
+_FIGURES = (
+    "metric", "base_mean", "mean", "change", "change_low", "change_high", "improvement", "improvement_low",
+    "improvement_high", "training_seeds", "pairs", "failed", "episodes", "base_failed", "base_episodes",
+    "change_per_training_seed", "sentence",
+)  # fmt: skip
+
+
+def _record(row: Change, swept: Sequence[str]) -> list[object]:
+    return [
+        row.policy, row.base, "residual" if row.is_family else "baseline", row.reference, row.scope, row.is_group,
+        "; ".join(row.marks), *(row.swept.get(name, "") for name in swept), row.column.metric, row.theirs, row.mine,
+        *_cells(row.relative), *_cells(row.improvement), row.num_seeds, row.num_pairs, row.falls, row.episodes,
+        row.base_falls, row.base_episodes, " ".join(f"{value:.6g}" for value in row.per_seed), row.sentence,
+    ]  # fmt: skip
+
+
+def _cells(estimate: Estimate) -> tuple[object, object, object]:
+    low, high = ("" if bound is None else bound for bound in (estimate.low, estimate.high))
+    return estimate.value, low, high
+
+
+def print_changes(rows: Sequence[Change], console: Console) -> None:
+    """Print the changes of the residuals, a line per cell; nothing without residuals."""
+    shown = [row for row in rows if row.is_family and row.is_judged]
+    if not shown:
+        return
+    console.print(changes_table(shown))
+
+
+def changes_table(rows: Sequence[Change]) -> Table:
+    """Changes of residuals against their bases, a line per cell with all judged metrics.
+
+    Args:
+        rows: Changes of families, of one environment.
+    """
+    columns = list(dict.fromkeys(row.column for row in rows))
+    swept = list(dict.fromkeys(name for row in rows for name in row.swept))
+    seeds = sorted({row.num_seeds for row in rows})
+    over = "one training seed, no interval"
+    if seeds != [1]:
+        over = f"interquartile mean and 95 % interval over {'/'.join(map(str, seeds))} training seeds"
+    marks = {mark for row in rows for mark in row.marks}
+    signs = [f"{sign} {words}" for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in marks)]
+    policies = list(dict.fromkeys(row.policy for row in rows))
+    named = ["residual"] if len(policies) > 1 else []  # else the title names it, which leaves room
+    whose = "" if named else f"{escape(policies[0])}: "
+    table = Table(
+        title=f"{whose}change against the base on the same episodes, {over}",
+        caption=", ".join([*signs, "* an interval that includes zero, or too few training seeds: no difference shown"]),
+        box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
+    )  # fmt: skip
+    for name in (*named, "reference", "scenario", *swept):
+        table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold")
+    for column in columns:
+        table.add_column(column.title, justify="right", no_wrap=True, vertical="bottom")
+    table.add_column(f"{rows[0].failure}\n(base)", justify="right", no_wrap=True, vertical="bottom")
+    previous: tuple[str, ...] = ()
+    for line in by_line(rows):
+        first = line[0]
+        if previous and previous[0] != first.policy:
+            table.add_section()
+        names = (first.policy, first.reference)
+        shown = ("",) * (1 + len(named)) if names == previous else names[1 - len(named) :]
+        previous = names
+        values = {row.column: row for row in line}
+        table.add_row(
+            *map(escape, shown), escape(first.scope) + _signs(first),
+            *(f"{first.swept[name]:g}" if name in first.swept else "-" for name in swept),
+            *(escape(_starred(values[column])) for column in columns), falls(first),
+            style="bold" if first.is_group else "",
+        )  # fmt: skip
+    return table
+
+
+_SIGNS = {HELD_OUT: "°", CEILING: "†", SAME_ROBOT: "‡"}
+
+
+def _signs(row: Change) -> str:
+    """Marks of a row as signs, where there is little room."""
+    found = [sign for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in row.marks)]
+    return f" {''.join(found)}" if found else ""
+
+
+def falls(row: Change) -> str:
+    """Failed episodes of all, and the base's in brackets; an exclamation mark where there are more."""
+    return f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes} ({row.base_falls}/{row.base_episodes})"
+
+
+def _starred(row: Change) -> str:
+    star = "" if row.verdict in ("lower", "higher") else " *"
+    return percent_interval(row.relative) + (star if np.isfinite(row.relative.value) else "")

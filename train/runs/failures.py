@@ -1,0 +1,66 @@
+"""What a user reads of a failure, and the exit code of `elastic`: one sentence each, from one place.
+
+| exit code | meaning |
+|---|---|
+| 0 | fine |
+| 1 | `elastic bench` alone: a figure is worse than accepted |
+| 2 | a wrong input: configuration, name, option, a policy of the user's that fails |
+| 3 | the system failed: disk, memory, process, port |
+| 70 | a defect of this program, with its traceback |
+| 128 + n | ended by signal n |
+"""
+
+import errno
+from collections.abc import Iterator
+
+WRONG_INPUT, SYSTEM_FAILED, DEFECT = 2, 3, 70
+
+_EXTRAS = {
+    "train": ("torch", "stable_baselines3", "tensorboard", "cmaes"),
+    "report": ("matplotlib", "plotly", "imageio", "imageio_ffmpeg", "PIL"),
+    "hardware": ("dynamixel_sdk", "serial", "mscl"),
+}
+_CURES = {
+    errno.ENOSPC: "free some space; a training goes on with --resume",
+    errno.EDQUOT: "free some of your quota; a training goes on with --resume",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f); a training goes on with --resume",
+    errno.EROFS: "name a folder that can be written, by --output",
+    errno.EACCES: "name a folder that can be written, by --output",
+}
+
+
+def explained(error: BaseException) -> tuple[str, int] | None:
+    """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
+    from elastic_env.core.errors import ElasticError, missing_extra
+
+    if is_interrupt(error):
+        return "interrupted", 130
+    if isinstance(error, ElasticError):
+        return str(error), error.exit_code
+    if isinstance(error, ModuleNotFoundError) and (extra := _extra_of(error)):
+        return str(missing_extra(str(error.name), extra, "this")), WRONG_INPUT
+    if isinstance(error, MemoryError):
+        return "there is not enough memory; take fewer worlds or fewer --jobs", SYSTEM_FAILED
+    for cause in _causes(error):
+        if isinstance(cause, OSError) and cause.errno is not None:
+            place = f"{cause.filename}: " if cause.filename else ""
+            cure = _CURES.get(cause.errno)
+            return f"{place}{cause.strerror}" + (f"; {cure}" if cure else ""), SYSTEM_FAILED
+    return None
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether it is Ctrl-C, which a module that is being loaded may turn into an error of its own."""
+    return any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error))
+
+
+def _extra_of(error: ModuleNotFoundError) -> str:
+    package = str(error.name).split(".")[0]
+    return next((extra for extra, packages in _EXTRAS.items() if package in packages), "")
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and what it came from."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__

@@ -1,0 +1,197 @@
+"""Result folders: never overwritten, each with the configuration, seed, versions and commit that made it."""
+
+import contextlib
+import fcntl
+import itertools
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from elastic_env.core.errors import ConfigurationError, ResultsExistError, SystemFailedError
+
+RUNS = Path("runs")
+"""Where results go unless a folder is named."""
+
+_LOCK = ".lock"
+_PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
+
+
+def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None) -> Path:
+    """Create a result folder and write down what its results depend on.
+
+    Args:
+        name: Name of the run; a taken name gets the next free number.
+        configuration: Resolved configuration, written as `config.yaml`.
+        seed: First seed, written with versions and commit as `metadata.json`.
+        output: Folder to use instead; it must not hold anything yet.
+
+    Returns:
+        The folder.
+
+    Raises:
+        ResultsExistError: The named output folder is not empty.
+    """
+    folder = free_folder(name, output)
+    (folder / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True))
+    (folder / "metadata.json").write_text(json.dumps(provenance(seed), indent=2) + "\n")
+    return folder
+
+
+def free_folder(name: str, output: Path | None = None) -> Path:
+    """A folder of one's own to write results to: the one that is named, or runs/<name>, numbered if taken.
+
+    It is made in one step, so that of several programs each gets another one.
+
+    Raises:
+        ConfigurationError: The name is no name of a folder.
+        ResultsExistError: The named folder is not empty.
+        SystemFailedError: The folder cannot be made.
+    """
+    try:
+        return _next_free(require_name(name)) if output is None else _empty(output)
+    except OSError as error:
+        place = RUNS if output is None else output
+        what = f"{error.filename or place}: {error.strerror or error}"
+        raise SystemFailedError(
+            f"no folder for results can be made at {place} ({what}); name one by --output"
+        ) from None
+
+
+def require_name(name: str) -> str:
+    """A name that is one folder's name and leads nowhere else.
+
+    Raises:
+        ConfigurationError: It is not.
+    """
+    if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
+        raise ConfigurationError(
+            f"name must be the name of a folder in {RUNS}, without / and not . or .., got {name!r}; to write "
+            "elsewhere, name a folder by --output"
+        )
+    return name
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other programs from a run for as long as this one works on it; a kill frees it.
+
+    Raises:
+        ConfigurationError: Another program works on it.
+    """
+    with (folder / _LOCK).open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            raise ConfigurationError(
+                f"another program, process {file.read().strip() or 'unknown'}, works on {folder}; wait until it has "
+                "ended, or end it"
+            ) from None
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield
+
+
+@contextmanager
+def own_folder(name: str, output: Path | None = None) -> Iterator[Path]:
+    """`free_folder` for the work within; it goes again if that fails without having written anything."""
+    folder = free_folder(name, output)
+    try:
+        yield folder
+    except BaseException:
+        with contextlib.suppress(OSError):  # it holds something
+            folder.rmdir()
+            folder.parent.rmdir()
+        raise
+
+
+@contextmanager
+def run_folder(
+    name: str, configuration: dict[str, Any], seed: int | None, output: Path | None = None
+) -> Iterator[Path]:
+    """A new run for the work within; it goes again if the work is interrupted or fails without a result.
+
+    Arguments and errors as `new_run`.
+    """
+    folder = new_run(name, configuration, seed, output)
+    described = set(folder.iterdir())
+    try:
+        yield folder
+    except BaseException:
+        made = described | {folder / _LOCK}
+        if set(folder.iterdir()) <= made:
+            for file in made:
+                file.unlink(missing_ok=True)
+            folder.rmdir()
+        raise
+
+
+def _next_free(name: str) -> Path:
+    """runs/<name>, or the first of its numbers that nobody has taken; `mkdir` makes it for one program alone."""
+    RUNS.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        folder = RUNS / (name if number == 1 else f"{name}-{number}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise AssertionError
+
+
+def _empty(folder: Path) -> Path:
+    if folder.exists() and not folder.is_dir():
+        raise ResultsExistError(f"{folder} is a file; name a folder that is new or empty")
+    if _holds_results(folder):
+        raise ResultsExistError(
+            f"{folder} already holds results ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), "
+            "which are never overwritten; name another folder, or leave --output out"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _holds_results(folder: Path) -> bool:
+    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+
+
+def provenance(seed: int | None) -> dict[str, Any]:
+    """When, from which commit and with which versions something is made."""
+    return {
+        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),  # noqa: UP017  Python 3.11 has both
+        "seed": seed,
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _commit() -> str | None:
+    """Commit of the source tree, with a + where it has uncommitted changes; None outside a repository."""
+    here = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ["git", *arguments], cwd=here, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,64 @@
+"""Code of the user that a name stands for: "module:function", or "FILE.py:function".
+
+Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual folder runs code.
+"""
+
+import importlib
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from elastic_env.core.errors import ConfigurationError
+
+_FILES = "elastic_user_file_"
+
+
+def named_object(name: str) -> Any:
+    """What a name stands for.
+
+    Args:
+        name: "module:attribute", or "FILE.py:attribute" with the path of a file, which need not be on the module path.
+
+    Raises:
+        ConfigurationError: There is no such module, file or attribute, or it fails while it is imported.
+    """
+    place, _, attribute = name.rpartition(":")
+    try:
+        module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
+    except (Exception, SystemExit) as error:
+        raise ConfigurationError(f"{place} cannot be imported: {type(error).__name__}: {error}") from error
+    if not hasattr(module, attribute):
+        own = [f.__name__ for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
+        raise ConfigurationError(f"{place} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}")
+    return getattr(module, attribute)
+
+
+def _from_path(module: str) -> ModuleType:
+    if not module or module.startswith("."):
+        raise ImportError("the module must have its full name")
+    return importlib.import_module(module)
+
+
+def _from_file(path: Path) -> ModuleType:
+    """A file as a module of a name of its own, so that train.py is not taken for our package."""
+    resolved = path.resolve()
+    name = _FILES + resolved.stem
+    known = sys.modules.get(name)
+    if known is not None and known.__file__ == str(resolved):
+        return known
+    if not resolved.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    spec = importlib.util.spec_from_file_location(name, resolved)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module

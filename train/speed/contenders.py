@@ -1,0 +1,294 @@
+"""What `elastic speed` times: every contender plays control steps of one environment and says how long it took."""
+
+import itertools
+import threading
+import time
+from typing import Any, Protocol
+
+import gymnasium
+import mujoco
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.features import Features
+from baselines.residual.residual import Network, ResidualDescription, ResidualPolicy
+from elastic_env.core.signals import Array
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.environments import environment
+from train.evaluate.evaluate import make_policy, make_vector_env
+
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class Contender(Protocol):
+    """Something that plays control steps.
+
+    Attributes:
+        title: What it is.
+        num_envs: Worlds.
+    """
+
+    title: str
+    num_envs: int
+
+    def run(self, steps: int) -> float:
+        """Play about so many control steps in every world; control steps per second of all worlds together."""
+        ...
+
+    def close(self) -> None:
+        """End what it has started."""
+        ...
+
+
+class VectorLoop:
+    """Our vector environment, with zero offsets or a policy in its loop; keeps the servo inputs of its last run."""
+
+    def __init__(
+        self, env: str, num_envs: int, threads: int, policy: str | None = None, residual: bool = False
+    ) -> None:
+        self.title = f"vector env{_with(policy, residual)}"
+        self.num_envs = num_envs
+        self.env = make_vector_env(_condition(env, policy), num_envs, threads)
+        self._policy = None if policy is None else make_policy(PolicySpec(name=policy), self.env)
+        if residual:
+            self._policy = untrained_residual(self._policy, self.env)
+        self._action = np.zeros(self.env.action_space.shape, dtype=np.float32)
+        self._observation, _ = self.env.reset(seed=0)
+        self._state: Any = None
+        self._start, self._done = np.ones(num_envs, dtype=np.bool_), np.zeros(num_envs, dtype=np.bool_)
+        self.controls = np.empty((0, *self.env.unwrapped.simulation.ctrl.shape))
+
+    def run(self, steps: int) -> float:
+        """See `Contender`."""
+        ctrl = self.env.unwrapped.simulation.ctrl
+        self.controls = np.empty((steps, *ctrl.shape))
+        begin = time.perf_counter()
+        for step in range(steps):
+            self.step()
+            self.controls[step] = ctrl
+        return self.num_envs * steps / (time.perf_counter() - begin)
+
+    def step(self) -> None:
+        """One control period in every world."""
+        if self._policy is not None:
+            self._action, self._state = self._policy.predict(self._observation, self._state, self._start, True)
+        self._observation, _, terminated, truncated, _ = self.env.step(self._action)
+        self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
+
+    def close(self) -> None:
+        """See `Contender`."""
+        self.env.close()
+
+
+class ScalarLoop:
+    """Our scalar environment under zero offsets, without Gymnasium's checks; keeps the servo inputs of its last run."""
+
+    title, num_envs = "scalar env", 1
+
+    def __init__(self, env: str) -> None:
+        self.env: Any = _make(env).unwrapped
+        self._action = np.zeros(self.env.action_space.shape or (), dtype=np.float32)
+        self.env.reset(seed=0)
+        self.controls = np.empty((0, *self.env.simulation.ctrl.shape))
+
+    def run(self, steps: int) -> float:
+        """See `Contender`."""
+        ctrl = self.env.simulation.ctrl
+        self.controls = np.empty((steps, *ctrl.shape))
+        begin = time.perf_counter()
+        for step in range(steps):
+            _, _, terminated, truncated, _ = self.env.step(self._action)
+            self.controls[step] = ctrl
+            if terminated or truncated:
+                self.env.reset()
+        return steps / (time.perf_counter() - begin)
+
+    def close(self) -> None:
+        """See `Contender`."""
+        self.env.close()
+
+
+class RawWorlds:
+    """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm in its cache.
+
+    It starts from the states of an environment and plays the servo inputs of its last run: on a thread nothing
+    but writing `ctrl` and one call of `mj_step` with all sub-steps of a control period.
+    """
+
+    title = "raw mj_step"
+
+    def __init__(self, loop: VectorLoop | ScalarLoop, threads: int) -> None:
+        task, simulation = loop.env.unwrapped.task, loop.env.unwrapped.simulation
+        self._loop, self.num_envs = loop, loop.num_envs
+        self._model, self._substeps = task.model, task.num_substeps
+        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
+        self.states = np.stack([self._state_of(simulation, world) for world in range(self.num_envs)])
+
+    def run(self, steps: int) -> float:
+        """See `Contender`; as many steps as the environment played last."""
+        return self.num_envs * steps / self.play(self._loop.controls)
+
+    def play(self, controls: Array) -> float:
+        """Time to play servo inputs, (steps, num_worlds, nu), in every world [s]."""
+        workers = [threading.Thread(target=self._play, args=(i, controls)) for i in range(len(self._data))]
+        begin = time.perf_counter()
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+        return time.perf_counter() - begin
+
+    def close(self) -> None:
+        """See `Contender`."""
+
+    def _play(self, thread: int, controls: Array) -> None:
+        model, data, substeps = self._model, self._data[thread], self._substeps
+        for world in range(thread, len(self.states), len(self._data)):
+            mujoco.mj_setState(model, data, self.states[world], _STATE)
+            ctrl = data.ctrl
+            for command in controls[:, world]:
+                ctrl[:] = command
+                mujoco.mj_step(model, data, substeps)
+            mujoco.mj_getState(model, data, self.states[world], _STATE)
+
+    def _state_of(self, simulation: Any, world: int) -> Array:
+        """Integration state of a world of the environment."""
+        data, state = self._data[0], np.empty(mujoco.mj_stateSize(self._model, _STATE))
+        mujoco.mj_resetData(self._model, data)
+        data.qpos[:], data.qvel[:] = simulation.qpos[world], simulation.qvel[world]
+        data.act[:], data.ctrl[:] = simulation.act[world], simulation.ctrl[world]
+        data.qacc_warmstart[:] = simulation.bind("qacc_warmstart")[world]
+        mujoco.mj_getState(self._model, data, state, _STATE)
+        return state
+
+
+class _ForeignLoop:
+    """Scalar environments of ours in somebody else's vector environment, under zero offsets."""
+
+    title: str
+    num_envs: int
+    _env: Any
+    _action: Array
+
+    def run(self, steps: int) -> float:
+        """See `Contender`."""
+        begin = time.perf_counter()
+        for _ in range(steps):
+            self._env.step(self._action)
+        return self.num_envs * steps / (time.perf_counter() - begin)
+
+    def close(self) -> None:
+        """See `Contender`."""
+        self._env.close()
+
+
+class GymnasiumLoop(_ForeignLoop):
+    """Scalar environments of ours under Gymnasium's SyncVectorEnv or AsyncVectorEnv, one process each in the latter."""
+
+    def __init__(self, env: str, kind: str, num_envs: int) -> None:
+        self.title, self.num_envs = f"Gymnasium {kind.capitalize()}VectorEnv", num_envs
+        self._env = gymnasium.make_vec(
+            environment(env).id, num_envs=num_envs, vectorization_mode=kind, **_arguments(env)
+        )
+        self._env.reset(seed=0)
+        self._action = np.zeros(self._env.action_space.shape or (), dtype=np.float32)
+
+
+class SB3Loop(_ForeignLoop):
+    """Scalar environments of ours under SB3's DummyVecEnv or SubprocVecEnv, one process each in the latter."""
+
+    def __init__(self, env: str, kind: str, num_envs: int) -> None:
+        from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+        self.title, self.num_envs = f"SB3 {kind}", num_envs
+        makers = [_Maker(env)] * num_envs
+        self._env = DummyVecEnv(makers) if kind == "DummyVecEnv" else SubprocVecEnv(makers, start_method="spawn")
+        self._env.reset()
+        self._action = np.zeros((num_envs, *(self._env.action_space.shape or ())), dtype=np.float32)
+
+
+class PPOLoop:
+    """PPO end to end, collecting and learning, of a residual on a base policy: our vector environment, or processes."""
+
+    def __init__(self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False) -> None:
+        import torch
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.vec_env import SubprocVecEnv
+
+        from baselines.residual_env import ResidualVectorWrapper
+        from train.learn.sb3_env import SB3VecEnv
+
+        where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
+        self.title, self.num_envs = f"PPO with {policy}, {where}", num_envs
+        space = "model" if policy not in ("zero", "uncompensated", "uncompensated_open") else "joint"
+        if processes:
+            venv: Any = SubprocVecEnv([_Maker(env, policy, space)] * num_envs, start_method="spawn")
+        else:
+            inner = make_vector_env(_condition(env, policy), num_envs, threads, AutoresetMode.SAME_STEP)
+            venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, space=space))
+        self._period = ResidualSettings().decision_period
+        torch.set_num_threads(1)
+        self._rollout = max(512 // num_envs, 8)
+        self._model = PPO(
+            "MlpPolicy", venv, n_steps=self._rollout, batch_size=512, n_epochs=10, gamma=0.95, device="cpu",
+            policy_kwargs={"net_arch": [64, 64]},
+        )  # fmt: skip
+
+    def run(self, steps: int) -> float:  # noqa: ARG002  a whole iteration is the least there is
+        """See `Contender`: one iteration of 512 decisions."""
+        before, begin = self._model.num_timesteps, time.perf_counter()
+        self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
+        return (self._model.num_timesteps - before) * self._period / (time.perf_counter() - begin)
+
+    def close(self) -> None:
+        """See `Contender`."""
+        self._model.get_env().close()  # type: ignore[union-attr]
+
+
+def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
+    """A residual with a network of 64×64 as it is before training, small random weights, around a base policy."""
+    space = "model" if hasattr(base, "predict_corrected") else "joint"
+    corrected = Corrected(base, env.unwrapped.assumed_model, ResidualSettings(space=space))
+    features, generator = Features(corrected).width, np.random.default_rng(0)
+    widths = [features, 64, 64, corrected.num_residuals]
+    tensors = {"mean": np.zeros(features), "std": np.ones(features)}
+    for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
+        tensors |= {f"weight{i}": 0.01 * generator.normal(size=(outputs, inputs)), f"bias{i}": np.zeros(outputs)}
+    description = ResidualDescription(robot=env.unwrapped.task.name, base="", settings=corrected.settings)
+    return ResidualPolicy(corrected, Network(description, tensors))
+
+
+class _Maker:
+    """Makes a scalar environment in a process of its own, with the residual of a base policy around it or without."""
+
+    def __init__(self, env: str, policy: str | None = None, space: str = "model") -> None:
+        self._env, self._policy, self._space = env, policy, space
+
+    def __call__(self) -> Any:
+        """The environment."""
+        made = _make(self._env)
+        if self._policy is None:
+            return made
+        from baselines.residual_env import ResidualWrapper
+
+        return ResidualWrapper(made, self._policy, space=self._space)  # type: ignore[arg-type]
+
+
+def _condition(env: str, policy: str | None) -> Condition:
+    return Condition(env=env, policy=PolicySpec(name=policy or "zero"), reference=environment(env).default_reference)
+
+
+def _arguments(env: str) -> dict[str, Any]:
+    return _condition(env, None).arguments
+
+
+def _make(env: str) -> gymnasium.Env[Any, Any]:
+    import elastic_env  # noqa: F401  registers the environments, also in a process of its own
+
+    return gymnasium.make(environment(env).id, **_arguments(env))
+
+
+def _with(policy: str | None, residual: bool) -> str:
+    parts = [part for part in (policy, "residual network" if residual else None) if part is not None]
+    return f" with {' and '.join(parts)}" if parts else ""
