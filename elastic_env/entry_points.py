@@ -1,7 +1,7 @@
 """Entry points of the registered environments: arguments of `gymnasium.make` become a task behind a face."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from numbers import Integral
 from pathlib import Path
@@ -14,7 +14,7 @@ from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
 from elastic_env.motion.references import AnyReference, make_reference
-from elastic_env.robots.testbed.config import RewardWeights, TestbedConfig
+from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.robots.testbed.task import TestbedTask
@@ -23,6 +23,7 @@ from elastic_env.robots.thormang.model import Thormang
 from elastic_env.robots.thormang.picture import WalkerPicture
 from elastic_env.robots.thormang.task import WalkTask
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.runtime.joint_config import RewardWeights
 from elastic_env.runtime.robot_model import read_stiffness, with_stiffness
 from elastic_env.runtime.scenario import Scenario, make_scenario
 
@@ -41,6 +42,7 @@ def configure_testbed(
     observe_link: bool = False,
     reward: RewardWeights | dict[str, float] | None = None,
     timestep_s: float | None = None,
+    sensors: Sequence[str] = (),
 ) -> TestbedConfig:
     """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
 
@@ -54,6 +56,8 @@ def configure_testbed(
         observe_link: Whether the link's IMU is part of the observation.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
+        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer"; see
+            `elastic_env.runtime.further_sensors`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -64,10 +68,11 @@ def configure_testbed(
         chosen = chosen.replace(stiffness=read_stiffness(stiffness))
     return TestbedConfig(
         reference=make_reference(reference),
-        scenario=make_scenario(scenario, testbed=True),
+        scenario=make_scenario(scenario, walks=False),
         joint=chosen,
         pendulum=pendulum if isinstance(pendulum, Pendulum) else Pendulum(**(pendulum or {})),
         form=form,
+        sensors=tuple(sensors),
         observe_link=observe_link,
         reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
         **({} if timestep_s is None else {"timestep_s": timestep_s}),

@@ -60,7 +60,7 @@ def cases() -> list[Case]:
     for env, own in (("testbed", "input"), ("walker", "input_output")):
         policies = [*policy_names(), *(f"residual:{name}" for name in RESIDUALS[env])]
         known = [policy for policy in policies if env == "walker" or policy not in WALKER_ALONE]
-        pairs = [(own, scenario) for scenario in scenario_names(testbed=env == "testbed")]
+        pairs = [(own, scenario) for scenario in scenario_names(walks=env == "walker")]
         pairs += [(policy, "nominal") for policy in known if policy != own]
         found += [Case(env, policy, scenario, worlds) for policy, scenario in pairs for worlds in (1, WORLDS)]
     sine, walk = '{"reference": {"kind": "sine", "duration_s": 1.0}}', '{"step_period": 1.1, "num_steps": 1}'

@@ -1,5 +1,6 @@
 """Plans: sampled trajectories of a reference, their building blocks, and tables of them for many worlds."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -92,7 +93,7 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
 
 @dataclass(frozen=True)
 class PlanRow:
-    """The reference of every world at its present step, (num_worlds,) each; see `Plan`."""
+    """The reference of every world at its present step, (num_worlds, n), scored and rest (num_worlds,); see `Plan`."""
 
     q: Array
     q_dot: Array
@@ -115,10 +116,19 @@ class Planned(Protocol):
 
 
 class PlanTable:
-    """The plans of all worlds as tables, one row per control step; a plan without randomness is held once."""
+    """The plans of all worlds as tables, one row per control step; a plan without randomness is held once.
 
-    def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
-        self._reference, self._period = reference, control_period_s
+    Every joint follows the reference about its home; of one that is random each joint has a plan of its own.
+
+    Args:
+        reference: It.
+        control_period_s: Time between commands [s].
+        num_worlds: How many.
+        home: Of the joints, (n,) [rad].
+    """
+
+    def __init__(self, reference: Planned, control_period_s: float, num_worlds: int, home: Array) -> None:
+        self._reference, self._period, self._home = reference, control_period_s, home
         probe = self._reference.plan(np.random.default_rng(0), self._period)
         self.num_steps = probe.num_steps
         if not probe.scored.any():
@@ -129,17 +139,22 @@ class PlanTable:
         self._is_shared = not reference.is_random
         self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
         rows = 1 if self._is_shared else num_worlds
-        self._motion = np.tile(np.stack([probe.q, probe.q_dot, probe.q_ddot], axis=-1), (rows, 1, 1))
+        self._motion = np.tile(self._of_joints([probe] * len(home)), (rows, 1, 1, 1))
         self._scored, self._rest = probe.scored, probe.rest
 
     def draw(self, world: int, generator: np.random.Generator) -> None:
         """A new plan for one world."""
         if not self._is_shared:
-            plan = self._reference.plan(generator, self._period)
-            self._motion[world] = np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1)
+            self._motion[world] = self._of_joints([self._reference.plan(generator, self._period) for _ in self._home])
 
     def at(self, step: IntArray) -> PlanRow:
         """Rows of the given steps, (num_worlds,); beyond the end the last row."""
         row = np.minimum(step, self.num_steps)
         motion = self._motion[self._row, row]
         return PlanRow(motion[:, 0], motion[:, 1], motion[:, 2], self._scored[row], self._rest[row])
+
+    def _of_joints(self, plans: Sequence[Plan]) -> Array:
+        """Angle, rate and acceleration of a plan for each joint, (T, 3, n)."""
+        motion = np.stack([np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1) for plan in plans], axis=-1)
+        motion[:, 0] += self._home
+        return motion

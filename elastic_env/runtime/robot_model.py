@@ -93,6 +93,10 @@ class RobotModel:
         """
         return replace(self, joints=with_stiffness(self.joints, stiffness))
 
+    def observed_by(self, table: SignalTable) -> "RobotModel":
+        """The same robot with this table of observations."""
+        return replace(self, observation_table=table)
+
     def _values(self, parameter: str) -> Array:
         return np.array([getattr(joint, parameter) for joint in self.joints.values()], dtype=np.float64)
 

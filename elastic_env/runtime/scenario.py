@@ -40,6 +40,7 @@ class Scenario(Model):
     gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0, description="walker: standard deviation of the gyroscope")
     force_noise_n: float = quantity("N", 0.0, ge=0, description="walker: standard deviation of the foot forces")
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
+    sensor_noise: float = quantity("1", 0.0, ge=0, description="factor on the errors of further sensors")
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
 
     @property
@@ -77,6 +78,7 @@ GROUNDS: dict[str, Scenario] = {
         gyro_noise_rad_s=_GYRO_NOISE_RAD_S,
         force_noise_n=_FORCE_NOISE_N,
         moment_noise_nm=_MOMENT_NOISE_NM,
+        sensor_noise=1.0,
     ),
 }
 
@@ -104,20 +106,22 @@ CHANGES: dict[str, Change] = {
 
 
 WALKER_ONLY = ("spread", "push", "slope")
-"""Changes that the single joint of the testbed does not know."""
+"""Changes that only a robot that walks knows."""
+WALKER_FIELDS = ("stiffness_spread", "push_n", "slope_rad")
+"""What they set."""
 
 
-def scenario_names(testbed: bool = False) -> list[str]:
-    """Names that `make_scenario` accepts, joined names aside; those of the testbed if asked."""
-    return [*GROUNDS, *(name for name in CHANGES if not (testbed and name in WALKER_ONLY))]
+def scenario_names(walks: bool = True) -> list[str]:
+    """Names that `make_scenario` accepts, joined names aside; only those of robots that do not walk if asked."""
+    return [*GROUNDS, *(name for name in CHANGES if walks or name not in WALKER_ONLY)]
 
 
-def make_scenario(name: "str | Scenario", testbed: bool = False) -> Scenario:
+def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
     """The scenario of a name such as "nominal", "soft", "ideal+soft" or "soft+payload".
 
     Args:
         name: Name, or the scenario itself.
-        testbed: Whether an unknown name is answered with those of the testbed.
+        walks: Whether an unknown name is answered with those of robots that walk, too.
 
     Raises:
         ConfigurationError: A part of the name does not exist, a ground stands behind another part, or two changes set
@@ -132,7 +136,7 @@ def make_scenario(name: "str | Scenario", testbed: bool = False) -> Scenario:
         if change in GROUNDS:
             raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
         if change not in CHANGES:
-            raise unknown_name("scenario", change, scenario_names(testbed))
+            raise unknown_name("scenario", change, scenario_names(walks))
         added = CHANGES[change](ground)
         twice = sorted(parameters.keys() & added.keys())
         if twice:

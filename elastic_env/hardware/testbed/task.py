@@ -23,7 +23,8 @@ from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.testbed.plant import ServoPlant
 from elastic_env.hardware.testbed.settings import HardwareSettings
 from elastic_env.robots.testbed.config import TestbedConfig
-from elastic_env.robots.testbed.task import METRICS, Measurement, TestbedSample, TestbedTask, TestbedTruth
+from elastic_env.robots.testbed.task import TestbedTask
+from elastic_env.runtime.joint_task import METRICS_OF_ONE, JointSample, JointTruth, Measurement
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import Simulation
 from elastic_env.runtime.task import Outcome
@@ -38,7 +39,7 @@ TIMING_METRICS = (
 
 
 @dataclass(frozen=True, slots=True)
-class HardwareSample(TestbedSample):
+class HardwareSample(JointSample):
     """What a step is scored by, and how well its period was kept, (1,) each."""
 
     motor_torque: Array
@@ -57,11 +58,9 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
-    name = "testbed"
-    metrics: Sequence[Metric] = (*METRICS, *TIMING_METRICS)
-
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
         super().__init__(config, num_worlds=1)
+        self.metrics: Sequence[Metric] = (*METRICS_OF_ONE, *TIMING_METRICS)
         self.plant = ServoPlant(self.model, self._at, settings, config.control_period_s, config.pendulum.gravity_torque)
         self._read_plant()
         extent, limits = config.reference.extent(), settings.limits
@@ -76,12 +75,13 @@ class HardwareTestbedTask(TestbedTask):
         """Drive the testbed to its start and let it settle under zero offset."""
         self._reference.draw(0, generators[0])
         self._step = np.zeros(1, dtype=np.int64)
-        self._offset, self._offset_before = np.zeros((2, 1))
+        self._offset, self._offset_before = np.zeros((2, 1, 1))
         self._command = self._reference.at(self._step).q.copy()
-        self.plant.begin(float(self._command[0]))
+        self.plant.begin(float(self._command[0, 0]))
         self._read(simulation, worlds)
         self._read_plant()
-        at_rest = Measurement(self._theta, self._theta, self._q)
+        theta, q = self._state.theta, self._state.q
+        at_rest = Measurement(theta, theta, q)
         self._measured = self._shown = at_rest
 
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
@@ -96,7 +96,7 @@ class HardwareTestbedTask(TestbedTask):
         """See `TestbedTask`."""
         measured, timing = super().sample(), self._timing
         return HardwareSample(
-            *(getattr(measured, field.name) for field in fields(TestbedSample)),
+            *(getattr(measured, field.name) for field in fields(JointSample)),
             motor_torque=self._motor_torque.copy(),
             jitter_s=np.array([timing.jitter_s]),
             period_s=np.array([timing.period_s]),
@@ -105,7 +105,7 @@ class HardwareTestbedTask(TestbedTask):
             limited=np.array([timing.limited]),
         )
 
-    def signals(self, sample: TestbedSample) -> Signals:
+    def signals(self, sample: JointSample) -> Signals:
         """See `TestbedTask`, and the table of the module."""
         assert isinstance(sample, HardwareSample)
         return {
@@ -118,7 +118,7 @@ class HardwareTestbedTask(TestbedTask):
             "limited": sample.limited.copy(),
         }
 
-    def truth(self) -> TestbedTruth:
+    def truth(self) -> JointTruth:
         """There is none on hardware.
 
         Raises:
@@ -131,6 +131,7 @@ class HardwareTestbedTask(TestbedTask):
 
     def _measure(self, worlds: BoolArray) -> Measurement:  # noqa: ARG002  there is one
         """The encoder's change is that of a control period also where a cycle had to be repeated."""
-        change = self._theta - self._measured.encoder
+        theta, q = self._state.theta, self._state.q
+        change = theta - self._measured.encoder
         periods = max(self.plant.timing.period_s / self.config.control_period_s, 1.0)
-        return Measurement(self._theta, self._theta - change / np.rint(periods), self._q)
+        return Measurement(theta, theta - change / np.rint(periods), q)

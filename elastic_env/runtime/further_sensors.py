@@ -1,0 +1,182 @@
+"""Sensors beyond the standard set of a robot: each is declared once, and observed where `sensors=[...]` asks for it.
+
+| name | columns | unit | shows | error in `nominal`, none in `ideal` |
+|---|---|---|---|---|
+| `link_encoder` | a joint each | rad | q in whole counts of the motor's encoder | homing error as of the encoders |
+| `joint_torque` | a joint each | N·m | torque of spring and damper on the link | noise 0.2, offset up to 0.5 |
+| `accelerometer` | x, y, z | m/s² | specific force at the IMU, acceleration minus gravity | noise 0.0112 |
+
+The noise of the accelerometer is that of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4, calib), at half the
+control rate of 250 Hz. That of the torque sensor is an assumption: 0.2 and 0.5 % of 100 N·m. It is drawn anew every
+control step, the offset every episode.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.errors import unknown_name
+from elastic_env.core.signals import Array, BoolArray, Signal
+from elastic_env.runtime.scenario import Scenario
+from elastic_env.runtime.sensors import NoiseStream, quantise
+
+
+class Measured(Protocol):
+    """What sensors need of the truth of a task, one row per world."""
+
+    @property
+    def q(self) -> Array:
+        """Link angles, (num_worlds, n) [rad]."""
+        ...
+
+    @property
+    def joint_torque(self) -> Array:
+        """Of spring and damper on the links, (num_worlds, n) [N·m]."""
+        ...
+
+    @property
+    def specific_force(self) -> Array:
+        """Acceleration of the IMU minus gravity, in its frame, (num_worlds, 3) [m/s²]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor by its declaration; table, noise, offset, age and mirror image follow from it.
+
+    Attributes:
+        unit, meaning: Of its columns.
+        truth: What it would show without error, (num_worlds, columns).
+        axes: Names of its columns; none where it has one per joint.
+        mirrored: Signs of its axes in the mirror, left for right; a joint's column is as the joint.
+        noise: Standard deviation [unit].
+        offset: Half-width of an offset that is drawn per episode [unit].
+        is_encoder: Whether it has whole counts, and the homing error of the encoders.
+    """
+
+    unit: str
+    meaning: str
+    truth: Callable[[Measured], Array]
+    axes: tuple[str, ...] = ()
+    mirrored: tuple[float, ...] = ()
+    noise: float = 0.0
+    offset: float = 0.0
+    is_encoder: bool = False
+
+    def names(self, name: str, joints: Sequence[str]) -> list[str]:
+        """Names of its columns."""
+        columns = self.axes or joints
+        return [name] if len(columns) == 1 else [f"{name}.{column}" for column in columns]
+
+
+SENSORS: Mapping[str, Sensor] = {
+    "link_encoder": Sensor("rad", "encoder on the link, q in whole counts", lambda truth: truth.q, is_encoder=True),
+    "joint_torque": Sensor(
+        "N·m", "torque sensor on the link side of the spring", lambda truth: truth.joint_torque, noise=0.2, offset=0.5
+    ),
+    "accelerometer": Sensor(
+        "m/s²", "specific force at the IMU, in its frame", lambda truth: truth.specific_force,
+        axes=("x", "y", "z"), mirrored=(1.0, -1.0, 1.0), noise=1.0e-3 * np.sqrt(125.0),
+    ),
+}  # fmt: skip
+"""Sensors by the name that `sensors=[...]` gives them."""
+
+ACCELEROMETER = "accelerometer"
+
+
+def add_accelerometer(spec: mujoco.MjSpec, site: str) -> None:
+    """Give a model the sensor that `specific_force` reads, at a site."""
+    spec.add_sensor(
+        name=ACCELEROMETER, type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
+    )
+
+
+def specific_force(model: mujoco.MjModel, sensordata: Array) -> Array:
+    """The accelerometer's columns of `sensordata`, (num_worlds, 3) [m/s²]."""
+    begin = int(model.sensor(ACCELEROMETER).adr[0])
+    return sensordata[:, begin : begin + 3].copy()
+
+
+class FurtherSensors:
+    """What some sensors of all worlds show.
+
+    Args:
+        names: Of `SENSORS`.
+        joints: The robot's joints, in order.
+        scenario: Whose `sensor_noise` scales noise and offset, and which has the encoders' errors.
+        counts_per_turn: Of the encoders.
+        num_worlds: How many.
+
+    Raises:
+        ConfigurationError: There is no such sensor.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        joints: Sequence[str],
+        scenario: Scenario,
+        counts_per_turn: int | None,
+        num_worlds: int,
+    ) -> None:
+        for name in names:
+            if name not in SENSORS:
+                raise unknown_name("sensor", name, SENSORS)
+        self._sensors = {name: SENSORS[name] for name in names}
+        self._scenario = scenario
+        self._counts = counts_per_turn if scenario.encoder_counts else None
+        columns = {name: sensor.names(name, joints) for name, sensor in self._sensors.items()}
+        self.signals = tuple(
+            Signal(column, sensor.unit, sensor.meaning)
+            for name, sensor in self._sensors.items()
+            for column in columns[name]
+        )
+        """Their columns of the observation, in order."""
+        kind: Any = np.dtype([(name, np.float64, (len(columns[name]),)) for name in names])
+        self._noise = NoiseStream(num_worlds, kind) if names else None
+        self._offset = {name: np.zeros((num_worlds, len(columns[name]))) for name in names}
+        self._now = self._before = np.zeros((num_worlds, len(self.signals)))
+
+    def __bool__(self) -> bool:
+        """Whether there is any."""
+        return bool(self._sensors)
+
+    def restart(self, worlds: BoolArray, generators: Sequence[np.random.Generator], truth: Measured) -> None:
+        """Draw the offsets of new episodes, and measure."""
+        if self._noise is None:
+            return
+        for world in np.flatnonzero(worlds).tolist():
+            for name, sensor in self._sensors.items():
+                offset = self._offset[name]
+                width = self._scenario.encoder_bias_rad if sensor.is_encoder else self._scale * sensor.offset
+                offset[world] = width * generators[world].uniform(-1.0, 1.0, offset.shape[1])
+            self._noise.restart(world, np.random.default_rng(generators[world].integers(2**63)))
+        self.measure(worlds, truth)
+        self._before = np.where(worlds[:, None], self._now, self._before)
+
+    def measure(self, worlds: BoolArray, truth: Measured) -> None:
+        """Take new values in some worlds; the others keep theirs."""
+        if self._noise is None:
+            return
+        drawn = self._noise.next(worlds)
+        shown = [
+            self._shown(sensor, sensor.truth(truth) + self._offset[name], drawn[name])
+            for name, sensor in self._sensors.items()
+        ]
+        self._before, self._now = self._now, np.where(worlds[:, None], np.hstack(shown), self._now)
+
+    def columns(self) -> Array:
+        """What they show, as old as the scenario's measurements are, (num_worlds, columns)."""
+        return self._before if self._scenario.delay_steps else self._now
+
+    @property
+    def _scale(self) -> float:
+        return self._scenario.sensor_noise
+
+    def _shown(self, sensor: Sensor, value: Array, drawn: Array) -> Array:
+        if sensor.is_encoder:
+            return quantise(value, self._counts)
+        return value + self._scale * sensor.noise * drawn

@@ -1,0 +1,75 @@
+"""Parameters of a task of elastic joints, whatever the robot."""
+
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.motion.references import Hold, Reference
+from elastic_env.runtime.scenario import WALKER_FIELDS, Scenario, make_scenario, scenario_names
+
+
+class RewardWeights(Model):
+    """Weights of the reward terms; every term is a penalty that grows without saturating."""
+
+    link_error: float = quantity("1/rad", 100.0, ge=0, description="per rad of link error: 1 at 0.01 rad")
+    command_rate: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offset")
+    divergence: float = quantity("1", 200.0, ge=0, description="once, where the simulation diverges")
+
+
+class JointConfig(Model):
+    """What all tasks of elastic joints have."""
+
+    reference: Reference = Hold()
+    scenario: Scenario = make_scenario("nominal")
+    form: Literal["tendon", "rigid"] = "tendon"
+    """Elastic, or rigid for what an inelastic robot would do."""
+    sensors: tuple[Title, ...] = Field(default=(), max_length=16)
+    """What is observed beside the standard set, see `elastic_env.runtime.further_sensors`."""
+    control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
+    timestep_s: float = quantity("s", 5e-4, gt=0, description="physics step")
+    reward: RewardWeights = RewardWeights()
+
+    @model_validator(mode="after")
+    def _scenario_acts(self) -> Self:
+        acting = [name for name in WALKER_FIELDS if getattr(self.scenario, name) > 0.0]
+        if acting:
+            raise ValueError(
+                f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker knows; here "
+                f"choose from: {', '.join(scenario_names(walks=False))}"
+            )
+        return self
+
+    def as_built(self, joint: ElasticJoint) -> ElasticJoint:
+        """A joint as the plant has it, which the scenario makes differ from the one that is known."""
+        scenario = self.scenario
+        return joint.replace(
+            stiffness=joint.stiffness * scenario.stiffness_scale,
+            coulomb_friction=joint.coulomb_friction * scenario.friction_scale,
+            viscous_friction=joint.viscous_friction * scenario.friction_scale,
+            backlash=joint.backlash + scenario.backlash_rad,
+        )
+
+
+def require_torque(reference: Reference, needed: Array, limits: Array) -> None:
+    """A reference that the servos cannot follow is an error now, not a poor result later.
+
+    Args:
+        reference: It.
+        needed: Largest torque that it can need of each servo, (n,) [N·m].
+        limits: Of the servos, (n,) [N·m].
+
+    Raises:
+        ConfigurationError: A servo is too weak.
+    """
+    if np.any(needed > limits):
+        weakest, extent = int(np.argmax(needed - limits)), reference.extent()
+        raise ConfigurationError(
+            f"the reference {reference.kind!r} can need {needed[weakest]:.1f} N·m of a servo limited to "
+            f"{limits[weakest]:.1f} N·m (|q| up to {extent.q:.2f} rad, |q̈| up to {extent.q_ddot:.2f} rad/s²); "
+            "lower its amplitude or its rate"
+        )
