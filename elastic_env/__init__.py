@@ -14,12 +14,14 @@ from elastic_env.rendering.headless import prefer_egl
 if TYPE_CHECKING:
     from elastic_env.joint.elasticity import ElasticJoint, Servo
     from elastic_env.joint.make_elastic import make_elastic
+    from elastic_env.robots.joint_robot import JointRobot
 
 __version__ = "0.1.0"
-__all__ = ["ElasticJoint", "Servo", "make_elastic"]
+__all__ = ["ElasticJoint", "JointRobot", "Servo", "make_elastic"]
 
 _HOMES = {
     "ElasticJoint": "elastic_env.joint.elasticity",
+    "JointRobot": "elastic_env.robots.joint_robot",
     "Servo": "elastic_env.joint.elasticity",
     "make_elastic": "elastic_env.joint.make_elastic",
 }
@@ -33,18 +35,9 @@ def __getattr__(name: str) -> Any:
 
 
 prefer_egl()
-gymnasium.register(
-    id="elastic_env/Testbed-v0",
-    entry_point="elastic_env.entry_points:make_testbed",
-    vector_entry_point="elastic_env.entry_points:make_testbed_vector",
-)
-gymnasium.register(
-    id="elastic_env/HardwareTestbed-v0",
-    entry_point="elastic_env.hardware.testbed.entry_points:make_hardware_testbed",
-    vector_entry_point="elastic_env.hardware.testbed.entry_points:make_hardware_testbed_vector",
-)
-gymnasium.register(
-    id="elastic_env/WalkInPlace-v0",
-    entry_point="elastic_env.entry_points:make_walk",
-    vector_entry_point="elastic_env.entry_points:make_walk_vector",
-)
+for _id, _home in {
+    "elastic_env/Testbed-v0": "elastic_env.robots.testbed.environment",
+    "elastic_env/WalkInPlace-v0": "elastic_env.robots.thormang.environment",
+    "elastic_env/HardwareTestbed-v0": "elastic_env.hardware.testbed.environment",
+}.items():
+    gymnasium.register(id=_id, entry_point=f"{_home}:make", vector_entry_point=f"{_home}:make_vector")

@@ -13,8 +13,9 @@ from baselines.residual.correction import ResidualSettings
 from elastic_env.core.config import Model, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
 from elastic_env.core.yaml_text import parse_yaml
-from elastic_env.entry_points import configure_testbed, configure_walk
 from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.robots.testbed.environment import configure_testbed
+from elastic_env.robots.thormang.environment import configure_walk
 from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig
 

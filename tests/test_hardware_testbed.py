@@ -21,7 +21,6 @@ import pytest
 
 import baselines
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.entry_points import configure_testbed
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.running import RunningEmulator
 from elastic_env.hardware.errors import HardwareError, PortError
@@ -32,6 +31,7 @@ from elastic_env.hardware.servo_bus.bus import States
 from elastic_env.hardware.servo_bus.torque_line import torque_of_current
 from elastic_env.hardware.testbed import plant
 from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.robots.testbed.environment import configure_testbed
 from tests.busy import once_more
 from train.commands.cli import main
 from train.experiments.identify import IdentifyConfig, identified_environments

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import elastic_env  # noqa: F401  registers the environments
-from elastic_env.entry_points import make_walk_vector
+from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.runtime.scenario import Scenario, make_scenario
 from elastic_env.runtime.sensors import AttitudeSensor
 

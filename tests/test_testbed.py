@@ -16,13 +16,14 @@ from hypothesis import strategies as st
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.entry_points import make_testbed, make_testbed_vector
 from elastic_env.joint.dynamixel import ENCODER_COUNTS_PER_TURN, H54_200_S500_R
 from elastic_env.joint.elasticity import Servo
 from elastic_env.motion.references import Hold, Sine
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.robots.testbed import task as testbed
 from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.robots.testbed.environment import make as make_testbed
+from elastic_env.robots.testbed.environment import make_vector as make_testbed_vector
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.runtime.scenario import make_scenario, scenario_names

@@ -123,9 +123,9 @@ class Emulate:
 
     def run(self) -> None:
         """Emulate."""
-        from elastic_env.entry_points import configure_testbed
         from elastic_env.hardware.emulator.config import EmulatorConfig
         from elastic_env.hardware.emulator.faults import Faults
+        from elastic_env.robots.testbed.environment import configure_testbed
         from train.hardware.session import emulate, require_switches
 
         require_switches(self.fault)

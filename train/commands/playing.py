@@ -71,7 +71,8 @@ class Evaluate:
     zero, uncompensated, input, dynamic, oracle; on the walker also
     uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
-    """Environment: testbed (one joint; with --port a real one) or walker (a humanoid that walks in place)."""
+    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in place),
+    or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, payload, backlash,
     sensor, ideal+soft; on the walker also spread, push, slope."""

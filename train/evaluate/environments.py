@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
+from elastic_env.robots.joint_robot import JointRobot
 from elastic_env.runtime.scenario import make_scenario
+from train.runs.user_code import named_object
 
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
@@ -157,14 +160,28 @@ _STEPS_OF_THE_PAPER = {"24 s": 2}
 
 
 def environment(name: str) -> Environment:
-    """The environment of a short name.
+    """The environment of a short name, or that of a robot of one's own.
+
+    Args:
+        name: Short name, or "FILE.py:ROBOT" or "module:ROBOT", a `JointRobot`, which is imported and registered.
 
     Raises:
         ConfigurationError: It does not exist.
     """
+    if ":" in name:
+        return _of_ones_own(name)
     if name not in ENVIRONMENTS:
-        raise unknown_name("environment", name, ENVIRONMENTS)
+        raise unknown_name("environment", name, [*ENVIRONMENTS, "FILE.py:ROBOT"])
     return ENVIRONMENTS[name]
+
+
+@lru_cache(maxsize=64)
+def _of_ones_own(name: str) -> Environment:
+    robot = named_object(name)
+    if not isinstance(robot, JointRobot):
+        raise ConfigurationError(f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}")
+    robot.register()
+    return replace(_JOINTS, id=robot.id)
 
 
 def _kind(reference: Reference) -> str:
@@ -236,6 +253,16 @@ _TESTBED = Environment(
         Signal("link error", "link_error", "mrad", 1e3),
     ),
 )  # fmt: skip
+
+_JOINTS = replace(
+    _TESTBED,
+    default_reference="multisine",
+    columns=tuple(column for column in _TESTBED.columns if not column.title.startswith("IMU")),
+    traced=("time_s", "link_error", "deflection", "joint_torque", "command_rate"),
+    figures=(),
+    curves=(Signal("link error", "link_error", "mrad", 1e3), Signal("deflection", "deflection", "mrad", 1e3)),
+)
+"""Several joints on a fixed base: the figures are those of all joints together."""
 
 _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
 

@@ -284,7 +284,8 @@ class _FirstWorld:
         self._traced = traced
         self._encoder = task.observation_table.group("encoder_angle")
         visits = getattr(getattr(task.config, "reference", None), "visits", None)
-        self.references, directions = visits if visits is not None else (np.zeros(0), None)
+        is_seen = "link_angle_imu" in traced  # static points need the IMU of the only link
+        self.references, directions = visits if visits is not None and is_seen else (np.zeros(0), None)
         self._recorder = HoldRecorder(directions) if directions is not None else None
         self._rows: list[tuple[float, ...]] = []
 

@@ -55,11 +55,12 @@ def resume(folder: Path, console: Console, jobs: int = 1, trust_code: bool = Fal
             f"{folder} is no training run: it has no {_CONFIG}; name the folder that train printed"
         )
     config = load_yaml(folder / _CONFIG, TrainConfig)
-    if ":" in config.algorithm and not trust_code:
-        raise ConfigurationError(
-            f"{folder / _CONFIG} names an algorithm of its own, {config.algorithm!r}, whose code would run; look at "
-            "it, then say --trust-code"
-        )
+    for what, name in (("an algorithm", config.algorithm), ("a robot", config.env)):
+        if ":" in name and not trust_code:
+            raise ConfigurationError(
+                f"{folder / _CONFIG} names {what} of its own, {name!r}, whose code would run; look at it, then say "
+                "--trust-code"
+            )
     with locked(folder):
         return _train(config, folder, console, jobs)
 

@@ -7,10 +7,10 @@ from typing import Any
 from gymnasium.vector import AutoresetMode
 
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
-from elastic_env.entry_points import configure_testbed
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.testbed.settings import HardwareSettings
 from elastic_env.hardware.testbed.task import HardwareTestbedTask
+from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 
@@ -25,8 +25,8 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
 
     Args:
         port: Port of the servo.
-        **arguments: Those of `HardwareSettings`, and of `elastic_env.entry_points.configure_testbed` but for `form` and
-            `timestep_s`; `scenario` can only be "hardware" or "nominal", and changes nothing.
+        **arguments: Those of `HardwareSettings`, and of `configure_testbed` of `elastic_env.robots.testbed.environment`
+            but for `form` and `timestep_s`; `scenario` can only be "hardware" or "nominal", and changes nothing.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -46,13 +46,13 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
     return HardwareTestbedTask(config, settings)
 
 
-def make_hardware_testbed(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
+def make(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
     """Entry point; arguments as in `configure_hardware`."""
     task = configure_hardware(**arguments)
     return ElasticEnv(task, render_mode, partial(TestbedPicture, task.config.pendulum), task.plant)
 
 
-def make_hardware_testbed_vector(
+def make_vector(
     num_envs: int = 1,
     num_threads: int = 0,  # noqa: ARG001  the same arguments as the other environments
     autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,

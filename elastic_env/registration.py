@@ -1,0 +1,84 @@
+"""What makes a robot an environment: its configuration, its task and its picture, registered with Gymnasium."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from numbers import Integral
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import AutoresetMode
+
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.rendering.picture import Picture
+from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.runtime.task import Task
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot, or a robot and what it does, as an environment.
+
+    Attributes:
+        name: Short name.
+        id: Of Gymnasium, such as elastic_env/Testbed-v0.
+        configure: Makes a configuration of the arguments of `gymnasium.make`.
+        task: Makes the rules from a configuration and a number of worlds.
+        picture: Makes the picture of a task.
+    """
+
+    name: str
+    id: str
+    configure: Callable[..., Any]
+    task: Callable[[Any, int], Task]
+    picture: Callable[[Any], Picture]
+
+    def make(self, render_mode: str | None = None, **arguments: Any) -> ElasticEnv:
+        """Entry point; arguments as in `configure`."""
+        task = self.task(self._configured(arguments), 1)
+        return ElasticEnv(task, render_mode, partial(self.picture, task))
+
+    def make_vector(
+        self,
+        num_envs: int = 1,
+        num_threads: int = 0,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **arguments: Any,
+    ) -> ElasticVectorEnv:
+        """Vector entry point; further arguments as in `configure`.
+
+        Raises:
+            ConfigurationError: A number of worlds or threads that cannot be.
+        """
+        bounds = ("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, ", 0 for all")
+        for name, number, least, note in bounds:
+            if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
+                raise ConfigurationError(f"{name} must be a whole number >= {least}{note}, got {shown(number)}")
+        task = self.task(self._configured(arguments), num_envs)
+        picture = partial(self.picture, task)
+        return ElasticVectorEnv(task, num_threads, autoreset_mode, render_mode=render_mode, picture=picture)
+
+    def register(self) -> None:
+        """Make the id known to Gymnasium; a second time changes nothing."""
+        if self.id not in gymnasium.registry:
+            gymnasium.register(id=self.id, entry_point=self.make, vector_entry_point=self.make_vector)
+
+    def _configured(self, arguments: dict[str, Any]) -> Any:
+        known = inspect.signature(self.configure).parameters
+        for name in arguments:
+            if name not in known:
+                raise unknown_name(f"argument of {self.id}", name, known)
+        return self.configure(**arguments)
+
+
+def require_models(**arguments: tuple[Any, type[Any]]) -> None:
+    """Refuse arguments that are neither a model, nor a mapping of its parameters, nor left out.
+
+    Raises:
+        ConfigurationError: One is none of these.
+    """
+    for name, (given, model) in arguments.items():
+        if not isinstance(given, dict | model | None):
+            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")

@@ -1,0 +1,210 @@
+"""A robot of one's own: a rigid model on a fixed base and its elastic joints, as an environment.
+
+    ARM = JointRobot("arm", rigid_arm, {"shoulder": JOINT, "elbow": JOINT})
+    ARM.register()
+    env = gymnasium.make("elastic_env/Arm-v0", scenario="soft", reference="multisine")
+
+`rigid_arm` is a function without arguments that returns a `mujoco.MjSpec`, whose hinges are all named here. Every joint
+follows the reference about its home, under the scenarios of robots that do not walk.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
+from elastic_env.joint.make_elastic import transformed
+from elastic_env.motion.references import AnyReference, make_reference
+from elastic_env.registration import Robot, require_models
+from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
+from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
+from elastic_env.runtime.joint_config import JointConfig, RewardWeights, require_torque
+from elastic_env.runtime.joint_task import JointPlant, JointTask
+from elastic_env.runtime.robot_model import RobotModel, read_stiffness, with_stiffness
+from elastic_env.runtime.scenario import Scenario, make_scenario
+
+_WIDTH, _HEIGHT = 640, 480
+_ENLARGED = 8.0
+"""Factor by which a picture enlarges deviations from the reference."""
+
+
+class JointRobotConfig(JointConfig):
+    """All of the environment of a robot of one's own."""
+
+    joints: dict[str, ElasticJoint]
+    """The joints as they are known; the scenario says in what the true ones differ."""
+
+
+@dataclass(frozen=True)
+class JointRobot:
+    """A robot of elastic joints on a fixed base.
+
+    Attributes:
+        name: Short name; the id is elastic_env/<Name>-v0.
+        rigid: Makes the rigid model, all of whose joints are hinges.
+        joints: Elastic joint of every hinge, with servo, in the order of all arrays.
+        home: Angle about which each joint follows the reference, (n,) [rad]; None for zeros.
+        load: Body that carries what the scenario `payload` adds; None for that of the last joint.
+        imu: Site of the accelerometer; None for a robot without one.
+    """
+
+    name: str
+    rigid: Callable[[], mujoco.MjSpec]
+    joints: Mapping[str, ElasticJoint]
+    home: Sequence[float] | None = None
+    load: str | None = None
+    imu: str | None = None
+
+    @property
+    def id(self) -> str:
+        """Of Gymnasium."""
+        return f"elastic_env/{self.name.title().replace('_', '')}-v0"
+
+    @property
+    def robot(self) -> Robot:
+        """The environment that it is."""
+        return Robot(self.name, self.id, self.configure, self._task, partial(JointPicture, self))
+
+    def register(self) -> None:
+        """Make its id known to Gymnasium."""
+        self.robot.register()
+
+    def configure(
+        self,
+        reference: str | dict[str, Any] | AnyReference = "multisine",
+        scenario: str | Scenario = "nominal",
+        stiffness: float | str | Path | list[float] | None = None,
+        form: Literal["tendon", "rigid"] = "tendon",
+        sensors: Sequence[str] = (),
+        reward: RewardWeights | dict[str, float] | None = None,
+        timestep_s: float | None = None,
+    ) -> JointRobotConfig:
+        """The configuration from the arguments of `gymnasium.make`.
+
+        Args:
+            reference: "sine", "multisine", "steps", "hold", a mapping with `kind` and parameters, or a reference model.
+            scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+            stiffness: K of the joints [N·m/rad], one number or one per joint; default that of the joints.
+            form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
+            sensors: What is observed beside the standard set, see `elastic_env.runtime.further_sensors`.
+            reward: Weights of the reward terms, or a mapping of what differs from the default.
+            timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
+
+        Raises:
+            ConfigurationError: A name, a parameter or a combination that does not exist.
+        """
+        require_models(reward=(reward, RewardWeights))
+        joints = dict(self.joints)
+        if stiffness is not None:
+            joints = with_stiffness(joints, read_stiffness(stiffness))
+        return JointRobotConfig(
+            reference=make_reference(reference),
+            scenario=make_scenario(scenario, walks=False),
+            joints=joints,
+            form=form,
+            sensors=tuple(sensors),
+            reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
+            **({} if timestep_s is None else {"timestep_s": timestep_s}),
+        )
+
+    def plant(self, config: JointRobotConfig) -> JointPlant:
+        """The robot as it is built, and as it is known.
+
+        Raises:
+            ConfigurationError: The reference needs more torque than the servos have, or a sensor has no place.
+        """
+        true_joints = {name: config.as_built(joint) for name, joint in config.joints.items()}
+        known, built = self.rigid(), _loaded(self.rigid(), self._load_body(), config.scenario.pendulum_mass_scale)
+        period = config.control_period_s
+        true = RobotModel(true_joints, built.copy().compile(), period)
+        body = RigidBody(true.rigid, list(true_joints))
+        home = np.zeros(len(true_joints)) if self.home is None else np.array(self.home, dtype=np.float64)
+        if home.shape != (len(true_joints),):
+            raise ConfigurationError(f"home must have one angle per joint, {len(true_joints)}, got {len(home)}")
+        _require_feasible(config, true, body, home)
+        spec = transformed(built, true_joints, config.form)
+        spec.option.timestep, spec.option.integrator = config.timestep_s, mujoco.mjtIntegrator.mjINT_RK4
+        # a NaN must end the episode, not restart the world behind the task's back
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if ACCELEROMETER in config.sensors:
+            if self.imu is None:
+                raise ConfigurationError(f"{self.name} has no IMU: name its site, JointRobot(..., imu=SITE)")
+            add_accelerometer(spec, self.imu)
+        return JointPlant(
+            name=self.name, model=spec.compile(), assumed=RobotModel(config.joints, known.compile(), period), true=true,
+            static_torque=body.gravity_torque, rest_angle=partial(_rest_angle, true=true, body=body), home=home,
+        )  # fmt: skip
+
+    def _load_body(self) -> str:
+        if self.load is not None:
+            return self.load
+        model = self.rigid().compile()
+        return str(model.body(model.joint(list(self.joints)[-1]).bodyid[0]).name)
+
+    def _task(self, config: JointRobotConfig, num_worlds: int) -> JointTask:
+        return JointTask(config, self.plant(config), num_worlds)
+
+
+class JointPicture(ModelPicture):
+    """The robot, its deviations from the reference enlarged.
+
+    Args:
+        robot: What is drawn.
+        task: Rules of the worlds whose true state is drawn.
+    """
+
+    def __init__(self, robot: JointRobot, task: JointTask) -> None:
+        spec = robot.rigid()
+        set_stage(spec, _WIDTH, _HEIGHT)
+        look = spec.copy().compile().stat
+        x, y, z = look.center
+        spec.worldbody.add_camera(
+            name=CAMERA, pos=[x, y - 2.4 * look.extent, z + 0.25 * look.extent], xyaxes=[1, 0, 0, 0, 0.1, 1]
+        )
+        super().__init__(spec, ())
+        self._task, self._joints = task, list(robot.joints)
+
+    def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the truth has every joint
+        q, q_ref = self._task.truth().q[world], self._task.sample().q_ref[world]
+        for name, angle in zip(self._joints, q_ref + _ENLARGED * (q - q_ref), strict=True):
+            self._data.joint(name).qpos = angle
+
+    def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
+        return [
+            f"t = {now['time_s']:6.2f} s     deviations from the reference drawn x {_ENLARGED:g}",
+            f"deflection {1e3 * now['deflection']:6.2f} mrad     link error {1e3 * now['link_error']:6.2f} mrad",
+        ]
+
+
+def _loaded(spec: mujoco.MjSpec, body: str, scale: float) -> mujoco.MjSpec:
+    """A model with the mass of a body scaled, where it is."""
+    if scale != 1.0:
+        made, carrier = spec.copy().compile().body(body), spec.body(body)
+        carrier.mass, carrier.inertia = float(made.mass[0]) * scale, made.inertia * scale
+        carrier.ipos, carrier.iquat, carrier.explicitinertial = made.ipos, made.iquat, True
+    return spec
+
+
+def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: RigidBody, home: Array) -> None:
+    """Refuse a reference that the servos cannot follow, by a plan of it."""
+    plan = config.reference.plan(np.random.default_rng(0), config.control_period_s)
+    rows = slice(None, None, max(plan.num_steps // 500, 1))
+    q, q_dot, q_ddot = (np.tile(x[rows, None], (1, len(home))) for x in (plan.q, plan.q_dot, plan.q_ddot))
+    motion = body.inverse_dynamics(q + home, q_dot, q_ddot) + robot.rotor_inertia * q_ddot
+    friction = robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
+    limits = np.array([servo.torque_limit for servo in robot.servos])
+    require_torque(config.reference, np.abs(motion).max(axis=0) + friction, limits)
+
+
+def _rest_angle(theta: Array, true: RobotModel, body: RigidBody) -> Array:
+    """Link angles at rest without friction: a dead band is crossed to the side to which the load pulls."""
+    engaged = theta - np.sign(body.gravity_torque(theta)) * true.backlash / 2.0
+    return static_link_angle(engaged, true.stiffness, body.gravity_torque, body.gravity_gradient)

@@ -1,0 +1,73 @@
+"""`elastic_env/Testbed-v0`: the arguments of `gymnasium.make`, and what they make."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from elastic_env.joint.dynamixel import H54_200_S500_R
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.motion.references import AnyReference, make_reference
+from elastic_env.registration import Robot, require_models
+from elastic_env.robots.testbed.config import TestbedConfig
+from elastic_env.robots.testbed.model import Pendulum
+from elastic_env.robots.testbed.picture import TestbedPicture
+from elastic_env.robots.testbed.task import TestbedTask
+from elastic_env.runtime.joint_config import RewardWeights
+from elastic_env.runtime.robot_model import read_stiffness
+from elastic_env.runtime.scenario import Scenario, make_scenario
+
+
+def configure_testbed(
+    reference: str | dict[str, Any] | AnyReference = "hold",
+    scenario: str | Scenario = "nominal",
+    stiffness: float | str | Path | None = None,
+    joint: ElasticJoint | dict[str, Any] | None = None,
+    pendulum: Pendulum | dict[str, Any] | None = None,
+    form: Literal["tendon", "rigid"] = "tendon",
+    observe_link: bool = False,
+    reward: RewardWeights | dict[str, float] | None = None,
+    timestep_s: float | None = None,
+    sensors: Sequence[str] = (),
+) -> TestbedConfig:
+    """The testbed's configuration from the arguments of `gymnasium.make("elastic_env/Testbed-v0", ...)`.
+
+    Args:
+        reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a reference model.
+        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+        stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that of the joint.
+        joint: Elastic joint, or a mapping of what differs from the paper's H54-200-S500-R, the default.
+        pendulum: The load, or a mapping of what differs from the default of 60 N·m at the horizontal.
+        form: "tendon" for the elastic joint, "rigid" for what an inelastic testbed would do.
+        observe_link: Whether the link's IMU is part of the observation.
+        reward: Weights of the reward terms, or a mapping of what differs from the default.
+        timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
+        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer"; see
+            `elastic_env.runtime.further_sensors`.
+
+    Raises:
+        ConfigurationError: A name, a parameter or a combination that does not exist.
+    """
+    require_models(joint=(joint, ElasticJoint), pendulum=(pendulum, Pendulum), reward=(reward, RewardWeights))
+    chosen = joint if isinstance(joint, ElasticJoint) else H54_200_S500_R.replace(**(joint or {}))
+    if stiffness is not None:
+        chosen = chosen.replace(stiffness=read_stiffness(stiffness))
+    return TestbedConfig(
+        reference=make_reference(reference),
+        scenario=make_scenario(scenario, walks=False),
+        joint=chosen,
+        pendulum=pendulum if isinstance(pendulum, Pendulum) else Pendulum(**(pendulum or {})),
+        form=form,
+        sensors=tuple(sensors),
+        observe_link=observe_link,
+        reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
+        **({} if timestep_s is None else {"timestep_s": timestep_s}),
+    )
+
+
+def picture(task: TestbedTask) -> TestbedPicture:
+    """The picture of a testbed."""
+    return TestbedPicture(task.config.pendulum)
+
+
+TESTBED = Robot("testbed", "elastic_env/Testbed-v0", configure_testbed, TestbedTask, picture)
+make, make_vector = TESTBED.make, TESTBED.make_vector

@@ -1,0 +1,79 @@
+"""`elastic_env/WalkInPlace-v0`: the arguments of `gymnasium.make`, and what they make."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.motion.gait import Gait, make_gait
+from elastic_env.registration import Robot, require_models
+from elastic_env.robots.thormang.config import WalkConfig, WalkRewardWeights
+from elastic_env.robots.thormang.model import Thormang
+from elastic_env.robots.thormang.picture import WalkerPicture
+from elastic_env.robots.thormang.task import WalkTask
+from elastic_env.runtime.robot_model import read_stiffness, with_stiffness
+from elastic_env.runtime.scenario import Scenario, make_scenario
+
+_GAIT = ("lift_m", "hip_height_m", "transfer")
+
+
+def configure_walk(
+    step_period: float | list[float] | tuple[float, float, float] | Gait = 3.0,
+    num_steps: int | None = None,
+    scenario: str | Scenario = "nominal",
+    stiffness: float | str | Path | list[float] | None = None,
+    joint: ElasticJoint | dict[str, Any] | None = None,
+    robot: Thormang | dict[str, Any] | None = None,
+    gait: dict[str, Any] | None = None,
+    form: Literal["tendon", "rigid"] = "tendon",
+    reward: WalkRewardWeights | dict[str, float] | None = None,
+    bank: int = 0,
+    timestep_s: float | None = None,
+) -> WalkConfig:
+    """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
+
+    Args:
+        step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support [s], or a `Gait`.
+        num_steps: Number of steps; default 4, or that of the `Gait`.
+        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+        stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an `identification.json`; default
+            that of the joints.
+        joint: Elastic joint for all twelve, or a mapping of what differs from the paper's H54-200-S500-R, the default.
+        robot: The robot's options, or a mapping of them: hip_half_spacing, twin_knee, friction.
+        gait: What differs from the default gait: lift_m, hip_height_m, transfer.
+        form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
+        reward: Weights of the reward terms, or a mapping of what differs from the default.
+        bank: Number of the bank that random robots come from, to keep those that are learned from apart.
+        timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
+
+    Raises:
+        ConfigurationError: A name, a parameter or a combination that does not exist.
+    """
+    require_models(joint=(joint, ElasticJoint), robot=(robot, Thormang), reward=(reward, WalkRewardWeights))
+    if not isinstance(gait, dict | None):
+        raise ConfigurationError(f"gait must be a mapping of {', '.join(_GAIT)}, got {gait!r}; see also step_period")
+    for name in gait or {}:
+        if name not in _GAIT:
+            raise unknown_name("parameter of gait beside step_period and num_steps", name, _GAIT)
+    chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
+    if isinstance(joint, ElasticJoint):
+        joints = dict.fromkeys(chosen.joints, joint)
+    else:
+        joints = {name: own.replace(**(joint or {})) for name, own in chosen.joints.items()}
+    if stiffness is not None:
+        joints = with_stiffness(joints, read_stiffness(stiffness))
+    steps = {} if num_steps is None else {"num_steps": num_steps}
+    return WalkConfig(
+        gait=make_gait(step_period, **steps, **(gait or {})),
+        scenario=make_scenario(scenario),
+        robot=chosen,
+        joints=tuple(joints.values()),
+        form=form,
+        reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
+        bank=bank,
+        **({} if timestep_s is None else {"timestep_s": timestep_s}),
+    )
+
+
+WALKER = Robot("walker", "elastic_env/WalkInPlace-v0", configure_walk, WalkTask, WalkerPicture)
+make, make_vector = WALKER.make, WALKER.make_vector
