@@ -17,6 +17,7 @@ from baselines.residual.correction import Corrected
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.biped import Biped
+from elastic_env.runtime.further_sensors import SENSORS
 from elastic_env.runtime.robot_model import WalkerModel
 
 _SHARES = {"clock.support", "load_share"}
@@ -45,6 +46,12 @@ _EVEN = {
     *(f"{group}.{axis}" for group in ("model_error", "uncertainty") for axis in ("roll", "pitch")),
 }
 """What keeps it."""
+_OF_SENSORS = {
+    f"{name}.{axis}": sign
+    for name, sensor in SENSORS.items()
+    for axis, sign in zip(sensor.axes, sensor.mirrored, strict=True)
+}
+"""What the columns of further sensors are, by their declarations."""
 _LATERAL_AXES = (0, 2)
 _SIDE = re.compile(r"(?<=\.)[lr]_")
 
@@ -140,6 +147,8 @@ def _sign(name: str, joints: set[str], lateral: set[str]) -> float:
     joint, plain = name.rpartition(".")[2], _SIDE.sub("", name)
     if joint in joints:
         return -1.0 if joint in lateral else 1.0
+    if plain in _OF_SENSORS:
+        return _OF_SENSORS[plain]
     if plain in _EVEN:
         return 1.0
     if plain in _ODD or plain in _SHARES:

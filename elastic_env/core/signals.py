@@ -1,6 +1,6 @@
 """Named arrays that know their units: the one description of what an observation or an action holds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -47,6 +47,10 @@ class SignalTable:
     def names(self) -> tuple[str, ...]:
         """Column names in order."""
         return tuple(signal.name for signal in self.signals)
+
+    def extended(self, signals: Sequence[Signal]) -> "SignalTable":
+        """This table with further columns behind its own."""
+        return SignalTable((*self.signals, *signals))
 
     def columns(self, *names: str) -> slice | list[int]:
         """Where the named columns stand, a slice if they are neighbours."""

@@ -44,6 +44,15 @@ class Measured(Protocol):
 
 
 @dataclass(frozen=True)
+class Felt:
+    """What is `Measured`, as it is."""
+
+    q: Array
+    joint_torque: Array
+    specific_force: Array
+
+
+@dataclass(frozen=True)
 class Sensor:
     """A sensor by its declaration; table, noise, offset, age and mirror image follow from it.
 

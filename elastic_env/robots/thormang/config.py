@@ -5,8 +5,9 @@ from typing import Literal
 
 import mujoco
 import numpy as np
+from pydantic import Field
 
-from elastic_env.core.config import Model, quantity
+from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import spring_name
@@ -16,6 +17,7 @@ from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
 from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, biped, elastic_spec
 from elastic_env.robots.thormang.standing import Equilibrium, settle
+from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.scenario import Scenario, make_scenario
 
 FALL_HEIGHT_SHARE = 0.75
@@ -47,6 +49,8 @@ class WalkConfig(Model):
     """The leg joints in order, as they are known; the scenario says in what the true ones differ."""
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
+    sensors: tuple[Title, ...] = Field(default=(), max_length=16)
+    """What is observed beside the standard set, see `elastic_env.runtime.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
     timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
     reward: WalkRewardWeights = WalkRewardWeights()
@@ -82,7 +86,10 @@ class WalkConfig(Model):
 
     def true_model(self) -> mujoco.MjModel:
         """The plant, a spread of stiffness and the direction of a slope aside."""
-        return elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s).compile()
+        spec = elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
+        if ACCELEROMETER in self.sensors:
+            add_accelerometer(spec, "imu")
+        return spec.compile()
 
 
 class RobotDraw(Model):

@@ -1,5 +1,6 @@
 """`elastic_env/WalkInPlace-v0`: the arguments of `gymnasium.make`, and what they make."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ def configure_walk(
     reward: WalkRewardWeights | dict[str, float] | None = None,
     bank: int = 0,
     timestep_s: float | None = None,
+    sensors: Sequence[str] = (),
 ) -> WalkConfig:
     """The walker's configuration from the arguments of `gymnasium.make("elastic_env/WalkInPlace-v0", ...)`.
 
@@ -45,6 +47,8 @@ def configure_walk(
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         bank: Number of the bank that random robots come from, to keep those that are learned from apart.
         timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
+        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer"; see
+            `elastic_env.runtime.further_sensors`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
@@ -69,6 +73,7 @@ def configure_walk(
         robot=chosen,
         joints=tuple(joints.values()),
         form=form,
+        sensors=tuple(sensors),
         reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
         bank=bank,
         **({} if timestep_s is None else {"timestep_s": timestep_s}),

@@ -59,7 +59,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from elastic_env.core.compiled import compile_now
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
+from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
 from elastic_env.dynamics import walk_kernels as kernels
 from elastic_env.dynamics.ground_contact import FootSensors
 from elastic_env.joint.elasticity import joint_torque
@@ -94,6 +94,7 @@ from elastic_env.robots.thormang.rows import (
     one,
 )
 from elastic_env.robots.thormang.tables import ACTION, FELL, METRICS, OBSERVATION, PHASES
+from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
@@ -112,7 +113,6 @@ class WalkTask:
 
     name = "walker"
     action_table = ACTION
-    observation_table = OBSERVATION
     assumed_model: RobotModel
     metrics: Sequence[Metric] = METRICS
     failure_names: tuple[str, ...] = (FELL,)
@@ -121,13 +121,16 @@ class WalkTask:
         self.config = config
         self.num_worlds = num_worlds
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
+        counts = next(iter(config.true_joints.values())).encoder_counts_per_turn
+        self._sensors = FurtherSensors(config.sensors, LEG_JOINTS, config.scenario, counts, num_worlds)
+        table = self.observation_table = OBSERVATION.extended(self._sensors.signals)
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
         model = self.assumed_model = WalkerModel(
-            config.assumed_joints, robot.rigid, config.control_period_s, OBSERVATION, biped=robot, plan=self.plan
+            config.assumed_joints, robot.rigid, config.control_period_s, table, biped=robot, plan=self.plan
         )
         require_feasible(self.plan, robot, model.servos)
-        self._true_model = _true_model(config, self.plan)
+        self._true_model = _true_model(config, self.plan, table)
         require_stable_walker(
             config.true_robot,  # pyright: ignore[reportArgumentType]  frozen models can be hashed
             tuple(config.true_joints.values()),  # pyright: ignore[reportArgumentType]
@@ -195,6 +198,8 @@ class WalkTask:
         kernels.begin(self._physics(simulation), self._walker, self._ready(), worlds, rows)
         self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
         self._shown = np.where(worlds, rows, self._shown)
+        if self._sensors:
+            self._sensors.restart(worlds, generators, self._felt(simulation))
 
     def _rehearse(self, simulation: Simulation) -> None:
         """Call all kernels on rows of their own."""
@@ -229,13 +234,29 @@ class WalkTask:
         )
         self._rows, self._shown = rows, last if self.config.scenario.delay_steps > 0 else rows
         self._has_fallen = outcome.ends[FELL_ROW]
-        return Outcome(_columns(outcome.observed), WalkSample(rows), outcome.reward, outcome.ends, is_over)
+        if self._sensors:
+            self._sensors.measure(~diverged, self._felt(simulation))
+        return Outcome(self._observation(outcome.observed), WalkSample(rows), outcome.reward, outcome.ends, is_over)
 
     def observe(self) -> Array:
         """See the table of the module."""
         observed = np.empty(self.num_worlds, OBSERVED)
         kernels.show(self._rows, self._shown, self._walker, observed)
-        return _columns(observed)
+        return self._observation(observed)
+
+    def _observation(self, observed: Records) -> Array:
+        """Rows of `OBSERVED` and what further sensors show, as the columns of an observation."""
+        columns = observed.view(np.float64).reshape(len(observed), -1)
+        return np.hstack([columns, self._sensors.columns()]) if self._sensors else columns
+
+    def _felt(self, simulation: Simulation) -> Felt:
+        """What further sensors feel; the specific force lags one physics step behind."""
+        truth = self._rows["truth"]
+        deflection, rate = truth["theta"] - truth["q"], truth["theta_dot"] - truth["q_dot"]
+        torque = joint_torque(deflection, rate, truth["stiffness"], self._damping, self._backlash)
+        has_force = ACCELEROMETER in self.config.sensors
+        force = specific_force(self.model, simulation.bind("sensordata")) if has_force else np.zeros((len(truth), 3))
+        return Felt(truth["q"].copy(), torque, force)
 
     def sample(self) -> WalkSample:
         """What this step is scored by."""
@@ -385,11 +406,6 @@ def _outcome(n: int) -> kernels.Outcome:
     return kernels.Outcome(np.empty(n, OBSERVED), np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_))
 
 
-def _columns(observed: Records) -> Array:
-    """Rows of `OBSERVED` as the columns of an observation, (n, 95)."""
-    return observed.view(np.float64).reshape(len(observed), -1)
-
-
 def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
     """Numbers that judge a control step, one row of `RULES`."""
     weights = one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()})
@@ -412,11 +428,11 @@ def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:
     )  # fmt: skip
 
 
-def _true_model(config: WalkConfig, plan: WalkPlan) -> WalkerModel:
+def _true_model(config: WalkConfig, plan: WalkPlan, table: SignalTable) -> WalkerModel:
     """The true joints and masses, and the torques that the planned motion needs of them."""
     true = biped(config.true_robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     plan = plan if config.true_robot == config.robot else with_torque(plan, true, config.control_period_s)
-    return WalkerModel(config.true_joints, true.rigid, config.control_period_s, OBSERVATION, biped=true, plan=plan)
+    return WalkerModel(config.true_joints, true.rigid, config.control_period_s, table, biped=true, plan=plan)
 
 
 TOUCHDOWN = -1
