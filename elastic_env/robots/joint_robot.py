@@ -34,6 +34,8 @@ from elastic_env.runtime.scenario import Scenario, make_scenario
 _WIDTH, _HEIGHT = 640, 480
 _ENLARGED = 8.0
 """Factor by which a picture enlarges deviations from the reference."""
+_REFERENCE, _REFERENCE_RGBA = "elastic_env_reference_", (0.35, 0.65, 0.45, 0.35)
+"""Prefix and colour of the robot that is the reference."""
 
 
 class JointRobotConfig(JointConfig):
@@ -154,7 +156,7 @@ class JointRobot:
 
 
 class JointPicture(ModelPicture):
-    """The robot, its deviations from the reference enlarged.
+    """The robot, its deviations from the reference enlarged, and the reference as a translucent robot.
 
     Args:
         robot: What is drawn.
@@ -169,13 +171,22 @@ class JointPicture(ModelPicture):
         spec.worldbody.add_camera(
             name=CAMERA, pos=[x, y - 2.4 * look.extent, z + 0.25 * look.extent], xyaxes=[1, 0, 0, 0, 0.1, 1]
         )
-        super().__init__(spec, ())
+        spec.worldbody.add_light(
+            pos=[x + look.extent, y - 3.0 * look.extent, z + 3.0 * look.extent], dir=[-0.2, 0.7, -0.7],
+            diffuse=[0.5] * 3, specular=[0.0] * 3, castshadow=False,
+        )  # fmt: skip
+        reference = robot.rigid()
+        for geom in reference.geoms:
+            geom.rgba = _REFERENCE_RGBA
+        spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
+        super().__init__(spec, (("translucent: reference", (0.27, 0.55, 0.37, 1.0)),))
         self._task, self._joints = task, list(robot.joints)
 
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the truth has every joint
         q, q_ref = self._task.truth().q[world], self._task.sample().q_ref[world]
-        for name, angle in zip(self._joints, q_ref + _ENLARGED * (q - q_ref), strict=True):
-            self._data.joint(name).qpos = angle
+        drawn = q_ref + _ENLARGED * (q - q_ref)
+        for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
+            self._data.joint(name).qpos, self._data.joint(_REFERENCE + name).qpos = angle, reference
 
     def _caption(self, now: dict[str, float], world: int) -> list[str]:  # noqa: ARG002
         return [

@@ -163,7 +163,7 @@ class Play:
     policy: str = "uncompensated"
     """Baseline, residual:PATH, or "FILE.py:function" for one's own; see elastic evaluate --help."""
     env: str = "testbed"
-    """Environment: testbed or walker."""
+    """Environment: testbed, walker, or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
     scenario: str = DEFAULT_SCENARIO
     """Scenario."""
     reference: str | None = None
