@@ -21,7 +21,7 @@ from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
-"""Share of the weight from which a foot counts as flat on the ground."""
+"""Share of the weight from which an estimate takes a foot for loaded, and flat on the ground."""
 MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
 """Standard deviations before the first measurement, of ρ and c, and of a measurement."""
 

@@ -25,13 +25,10 @@ On two feet that is too much about x, where a leaning weight goes from one foot 
 
 import numpy as np
 
-from baselines.estimation.bending import BendingObserver
+from baselines.estimation.bending import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
-
-LOADED_SHARE = 0.15
-"""Share of the weight from which the feet count as loaded."""
 
 TILT_RAD, VELOCITY_M_PER_S = 0.01, 0.07
 """σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well velocities are known."""
