@@ -16,7 +16,7 @@ from train.learn.train_config import TrainConfig
 from train.learn.training import Training
 from train.runs.failures import SYSTEM_FAILED, explained
 
-MUTATIONS, FULL_DISKS = 300, 4
+MUTATIONS, FULL_DISKS = 300, 3
 
 
 def write(checkpoint: Path, text: str) -> None:
