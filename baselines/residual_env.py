@@ -21,10 +21,13 @@ from baselines.residual.correction import Corrected, ResidualSettings, Space
 from baselines.residual.features import Features
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.state import Stateful
 
 
-class _Deciding:
+class _Deciding(Stateful):
     """Base policy, correction and features of some worlds, and their memories."""
+
+    STATE = ("_start", "_fresh", "_state", "_past", "_base")
 
     def __init__(self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int) -> None:
         if not hasattr(env.unwrapped, "assumed_model"):
@@ -34,6 +37,7 @@ class _Deciding:
         self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
         self.features = Features(self.corrected)
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
+        self._base = policy if hasattr(policy, "get_state") else None  # others keep their memory in `state`
         self._state: Any = None
         self._past: Array | None = None
 
@@ -128,7 +132,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         return self._deciding.observe(self._last[None])[0], total, terminated, truncated, info
 
 
-class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
+class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, Any]):
     """Many worlds whose actions are residuals of a base policy, (num_envs, k).
 
     It restarts worlds itself, between decisions only.
@@ -146,6 +150,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     Raises:
         ConfigurationError: Settings that are not valid, or that this base cannot have.
     """
+
+    STATE = ("env", "_deciding", "_rows", "_last", "_done", "_decisions", "_cut_at")
 
     def __init__(
         self,

@@ -7,7 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.core.state import Stateful
 
 STAND_S = 1.0
 """Time at the first position in which policies ramp in; not scored."""
@@ -91,8 +93,8 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
     return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
 
 
-@dataclass(frozen=True)
-class PlanRow:
+@dataclass(frozen=True, slots=True)
+class PlanRow(Rows):
     """The reference of every world at its present step, (num_worlds, n), scored and rest (num_worlds,); see `Plan`."""
 
     q: Array
@@ -115,7 +117,7 @@ class Planned(Protocol):
         ...
 
 
-class PlanTable:
+class PlanTable(Stateful):
     """The plans of all worlds as tables, one row per control step; a plan without randomness is held once.
 
     Every joint follows the reference about its home; of one that is random each joint has a plan of its own.
@@ -126,6 +128,8 @@ class PlanTable:
         num_worlds: How many.
         home: Of the joints, (n,) [rad].
     """
+
+    STATE = ("_motion",)
 
     def __init__(self, reference: Planned, control_period_s: float, num_worlds: int, home: Array) -> None:
         self._reference, self._period, self._home = reference, control_period_s, home

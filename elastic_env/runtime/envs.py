@@ -14,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
+from elastic_env.core.state import Stateful
 from elastic_env.rendering.picture import Picture
 from elastic_env.runtime.physics import Simulation
 from elastic_env.runtime.robot_model import RobotModel
@@ -150,7 +151,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
 
 class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
-    _Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+    _Faces, Stateful, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
 ):
     """Many worlds of a task on a thread pool.
 
@@ -165,6 +166,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         render_mode: "rgb_array" or None.
         picture: Makes the picture of the task when it is first rendered.
     """
+
+    STATE = ("_worlds", "_generators", "_done", "_is_begun")
 
     def __init__(
         self,

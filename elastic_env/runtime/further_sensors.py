@@ -20,6 +20,7 @@ import numpy as np
 
 from elastic_env.core.errors import unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal
+from elastic_env.core.state import Stateful
 from elastic_env.runtime.scenario import Scenario
 from elastic_env.runtime.sensors import NoiseStream, quantise
 
@@ -109,7 +110,7 @@ def specific_force(model: mujoco.MjModel, sensordata: Array) -> Array:
     return sensordata[:, begin : begin + 3].copy()
 
 
-class FurtherSensors:
+class FurtherSensors(Stateful):
     """What some sensors of all worlds show.
 
     Args:
@@ -122,6 +123,8 @@ class FurtherSensors:
     Raises:
         ConfigurationError: There is no such sensor.
     """
+
+    STATE = ("_noise", "_offset", "_now", "_before")
 
     def __init__(
         self,

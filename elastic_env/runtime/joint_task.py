@@ -15,6 +15,7 @@ import numpy as np
 
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
+from elastic_env.core.state import Stateful
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.joint.time_step import require_stable
@@ -202,7 +203,7 @@ def observation_signals(joints: Sequence[str]) -> list[Signal]:
     return [Signal(one, unit, meaning) for name, unit, meaning in per_joint for one in named(name, joints)]
 
 
-class JointTask:
+class JointTask(Stateful):
     """Rules of a robot of elastic joints, see `elastic_env.runtime.task.Task`.
 
     Args:
@@ -211,6 +212,11 @@ class JointTask:
         num_worlds: How many.
         observe_imu: Whether the IMU of the only link is observed.
     """
+
+    STATE = (
+        "_reference", "_noise", "_sensors", "_step", "_present", "_coming", "_state", "_measured", "_shown",
+        "_encoder_bias", "_imu_bias", "_offset", "_offset_before", "_command", "_diverged", "_force",
+    )  # fmt: skip
 
     failure_names: tuple[str, ...] = ()  # what stands on a fixed base cannot fall over
 
@@ -236,6 +242,7 @@ class JointTask:
         self._noise = NoiseStream(num_worlds, NOISE)
         self._reference = PlanTable(config.reference, config.control_period_s, num_worlds, plant.home)
         self._step = np.zeros(num_worlds, dtype=np.int64)
+        self._present = self._coming = self._reference.at(self._step)
         self._state = JointState(*np.zeros((4, num_worlds, n)))
         self._measured = self._shown = Measurement(*np.zeros((3, num_worlds, n)))
         self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds, n))
@@ -257,8 +264,9 @@ class JointTask:
             self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
         self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
+        self._follow()
         self._offset[worlds] = self._offset_before[worlds] = 0.0
-        self._command[worlds] = self._reference.at(self._step).q[worlds]
+        self._command[worlds] = self._present.q[worlds]
         if self._sensors:
             simulation.bind("sensordata")
         self._place(simulation, worlds)
@@ -275,7 +283,7 @@ class JointTask:
     def command(self, offset: Array, inputs: Array) -> None:
         """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
         self._offset_before, self._offset = self._offset, offset.copy()
-        self._command = self._reference.at(self._step + 1).q + self._offset
+        self._command = self._coming.q + self._offset
         inputs[:, self._inputs] = self._command - self._encoder_bias
 
     def disturb(self, simulation: Simulation) -> None:
@@ -285,6 +293,7 @@ class JointTask:
         """Read the new state, then what the sensors show of it; score it."""
         diverged = diverged | (np.abs(simulation.qvel) > DIVERGED_RAD_S).any(axis=1)
         self._step, self._diverged = self._step + 1, diverged
+        self._present, self._coming = self._coming, self._reference.at(self._step + 1)
         self._read(simulation, ~diverged)
         before, self._measured = self._measured, self._measure(~diverged)
         self._shown = before if self.config.scenario.delay_steps else self._measured
@@ -298,7 +307,7 @@ class JointTask:
 
     def observe(self) -> Array:
         """The columns of `observation_table`."""
-        coming, shown = self._reference.at(self._step + 1), self._shown
+        coming, shown = self._coming, self._shown
         rate = (shown.encoder - shown.encoder_before) / self.config.control_period_s
         columns = [shown.encoder, rate, coming.q, coming.q_dot, coming.q_ddot, self._command]
         if self._observes_imu:
@@ -309,7 +318,7 @@ class JointTask:
 
     def sample(self) -> JointSample:
         """What this step is scored by."""
-        reference = self._reference.at(self._step)
+        reference = self._present
         servo_error = self._command - self._encoder_bias - self._state.theta
         command_rate = (self._offset - self._offset_before) / self.config.control_period_s
         return JointSample(
@@ -396,7 +405,11 @@ class JointTask:
         """The true state of some worlds; the others keep their last one."""
         at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
         now = JointState(qpos[:, at.theta], qvel[:, at.theta_dot], qpos[:, at.q], qvel[:, at.q_dot])
-        self._state = self._state.with_worlds(worlds, now)
+        self._state = now if worlds.all() else self._state.with_worlds(worlds, now)
+
+    def _follow(self) -> None:
+        """Look the reference up at the present step and at the next one."""
+        self._present, self._coming = self._reference.at(self._step), self._reference.at(self._step + 1)
 
     def _feel(self, simulation: Simulation) -> None:
         """Take the specific force, which lags one physics step behind, where the model has the sensor for it."""
@@ -414,7 +427,7 @@ class JointTask:
             encoder_before=last.encoder,
             imu=np.where(due[:, None], attitude(scenario.imu, self._state.q, self._imu_bias, noise), last.imu),
         )
-        return last.with_worlds(worlds, fresh)
+        return fresh if worlds.all() else last.with_worlds(worlds, fresh)
 
 
 def _of_one(of_joints: dict[str, Array]) -> Signals:

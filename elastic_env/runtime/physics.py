@@ -83,7 +83,7 @@ class _Warnings:
 
     def diverged(self, counts: IntArray) -> BoolArray:
         """Worlds with a bad number, from the counts of all warnings, (num_worlds, kinds)."""
-        if not counts.any():
+        if not np.count_nonzero(counts):
             return np.zeros(len(counts), dtype=np.bool_)
         is_bad = np.asarray(counts[:, _BAD].any(axis=1))
         for kind in np.flatnonzero(counts[~is_bad].any(axis=0)).tolist():  # what explodes has every fault
@@ -99,18 +99,34 @@ class SingleWorld:
     num_worlds = 1
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.__setstate__({"model": model, "varies": False, "data": mujoco.MjData(model), "warnings": _Warnings()})
+        self.__setstate__({"model": model, "varied": set(), "data": mujoco.MjData(model), "warnings": _Warnings()})
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the live views, for `copy.deepcopy` and pickle."""
-        return {"model": self.model, "varies": self._varies, "data": self._data, "warnings": self._warnings}
+        return {"model": self.model, "varied": self._varied, "data": self._data, "warnings": self._warnings}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.model, self._varies = state["model"], state["varies"]
+        self.model: mujoco.MjModel = state["model"]
+        self._varied: set[str] = state["varied"]
         self._data, self._warnings = state["data"], state["warnings"]
         self._counts, self._views = self._data.warning.number[None], dict[tuple[str, ...], tuple[Array, ...]]()
         self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
         self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
+
+    def get_state(self) -> dict[str, Any]:
+        """See `ManyWorlds`; of one world."""
+        kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        state = np.zeros(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self._data, state, kind)
+        varied = {field: getattr(self.model, field).copy() for field in sorted(self._varied)}
+        return {"state": state, "warning": self._counts.copy(), "varied": varied}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """See `ManyWorlds`."""
+        for field, values in state["varied"].items():
+            self.vary(field)[0] = values
+        mujoco.mj_setState(self.model, self._data, state["state"], int(mujoco.mjtState.mjSTATE_INTEGRATION))
+        self._counts[:] = state["warning"]
 
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
@@ -124,8 +140,9 @@ class SingleWorld:
 
     def vary(self, field: str) -> Array:
         """See `Simulation`."""
-        if not self._varies:
-            self.model, self._varies = copy.copy(self.model), True
+        if not self._varied:
+            self.model = copy.copy(self.model)
+        self._varied.add(field)
         return getattr(self.model, field)[None]
 
     def advance(self, num_substeps: int) -> None:

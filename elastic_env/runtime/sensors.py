@@ -6,6 +6,7 @@ import numpy as np
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.core.state import Stateful
 
 
 class AttitudeSensor(Model):
@@ -70,7 +71,7 @@ def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray
     return (step == 0) | (np.floor(step * samples_per_step + 1e-9) > np.floor((step - 1) * samples_per_step + 1e-9))
 
 
-class NoiseStream:
+class NoiseStream(Stateful):
     """Standard normal samples, one independent stream per world, drawn in blocks.
 
     World i's samples depend on its generator and on how many it has used, never on the other worlds.
@@ -80,6 +81,8 @@ class NoiseStream:
         kind: Structured type of a sample, of real numbers alone.
         block: Samples that are drawn at once.
     """
+
+    STATE = ("_samples", "_used", "_most_used", "_generators")
 
     def __init__(self, num_worlds: int, kind: np.dtype[Any], block: int = 250) -> None:
         # samples of a time are neighbours in memory: worlds mostly use theirs together

@@ -9,11 +9,12 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.state import Stateful
 
 _NOTHING: dict[str, Any] = {}
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(Stateful, VecEnv):
     """A Gymnasium vector environment with same-step autoreset as an SB3 `VecEnv`.
 
     Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`: reward r, length l in
@@ -27,6 +28,8 @@ class SB3VecEnv(VecEnv):
     Raises:
         ConfigurationError: Another autoreset mode.
     """
+
+    STATE = ("env", "_stagger", "_reward", "_length", "_seeds")
 
     def __init__(
         self, env: gymnasium.vector.VectorEnv[Any, Any, Any], stagger: np.random.Generator | None = None

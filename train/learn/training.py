@@ -22,10 +22,11 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual.residual import ResidualDescription
+from elastic_env.core.state import given, taken
 from train.learn.algorithms import algorithm_class, options_named
 from train.learn.export import network_of
 from train.learn.sb3_env import SB3VecEnv
-from train.learn.state import capture, read_state, restore, write_state
+from train.learn.state import read_state, write_state
 from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
 from train.learn.trainer import Trainer
 
@@ -147,8 +148,8 @@ class Training(Trainer):
             "old_reward": normaliser.old_reward,
             "numpy": [numpy_state[0], numpy_state[1], *numpy_state[2:]],
             "python": _listed(random.getstate()),
-            "actions": capture(model.action_space.np_random),
-            "worlds": capture(self._worlds),
+            "actions": taken(model.action_space.np_random, "the action space"),
+            "worlds": self._worlds.get_state(),
         }
         if isinstance(model, OffPolicyAlgorithm):
             buffer = model.replay_buffer
@@ -173,8 +174,8 @@ class Training(Trainer):
         normaliser.old_obs, normaliser.old_reward = state["old_observation"], state["old_reward"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
         random.setstate(_tupled(state["python"]))
-        restore(model.action_space.np_random, state["actions"])
-        restore(self._worlds, state["worlds"])
+        given(model.action_space.np_random, state["actions"])
+        self._worlds.set_state(state["worlds"])
         if model.ep_info_buffer is None:
             model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
         if isinstance(model, OffPolicyAlgorithm):

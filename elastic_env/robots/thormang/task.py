@@ -60,6 +60,7 @@ import numpy as np
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
+from elastic_env.core.state import Stateful
 from elastic_env.dynamics import walk_kernels as kernels
 from elastic_env.dynamics.ground_contact import FootSensors
 from elastic_env.joint.elasticity import joint_torque
@@ -104,12 +105,18 @@ from elastic_env.runtime.task import Outcome
 
 FELL_ROW, NUM_ENDS = 1, 4
 """Of what ends an episode, beside `elastic_env.runtime.task.DIVERGED_ROW` and those after it."""
+_ROWS_AT_ONCE = 64
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
 
-class WalkTask:
+class WalkTask(Stateful):
     """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.runtime.task.Task`."""
+
+    STATE = (
+        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_sensors", "_rows", "_shown", "_offset",
+        "_has_fallen",
+    )  # fmt: skip
 
     name = "walker"
     action_table = ACTION
@@ -162,12 +169,14 @@ class WalkTask:
             rules=_rules(config, UNLOADED_SHARE * weight, least_n),
         )  # fmt: skip
         self._plan_rows = _plan_rows(self.plan, config)
+        self._known = kernels.Walker(self._constants, self._plan_rows, self._bias)
         self._draw = np.zeros(n, dtype=np.int64)
         self._damping = self._true_model.damping
         self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
         self._noise = NoiseStream(n, NOISE)
         self._rows = self._shown = np.zeros(n, STEP)
+        self._rows_ahead, self._rows_left = np.zeros((0, n), STEP), 0
         self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
         self._phases.flags.writeable = False
         self._is_compiled = False
@@ -227,7 +236,7 @@ class WalkTask:
 
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
         """Read the new state, then what the sensors show of it; score it."""
-        n, last, rows = self.num_worlds, self._rows, np.empty(self.num_worlds, STEP)
+        n, last, rows = self.num_worlds, self._rows, self._next_rows()
         outcome, commanded = _outcome(n), (self._offset, diverged)
         is_over = kernels.control_step(
             self._physics(simulation), self._walker, self._ready(), commanded, last, rows, outcome
@@ -237,6 +246,14 @@ class WalkTask:
         if self._sensors:
             self._sensors.measure(~diverged, self._felt(simulation))
         return Outcome(self._observation(outcome.observed), WalkSample(rows), outcome.reward, outcome.ends, is_over)
+
+    def _next_rows(self) -> Records:
+        """Rows for a control step, of which samples may keep them: several are made at once, which costs less."""
+        if self._rows_left == 0:
+            self._rows_ahead = np.zeros((max(_ROWS_AT_ONCE // self.num_worlds, 1), self.num_worlds), STEP)
+            self._rows_left = len(self._rows_ahead)
+        self._rows_left -= 1
+        return self._rows_ahead[self._rows_left]
 
     def observe(self) -> Array:
         """See the table of the module."""
@@ -334,7 +351,10 @@ class WalkTask:
 
     @property
     def _walker(self) -> kernels.Walker:
-        return kernels.Walker(self._constants, self._plan_rows, self._bias)
+        """What the kernels know of the robot, made anew where its biases have been, as when a state is restored."""
+        if self._known.bias is not self._bias:
+            self._known = kernels.Walker(self._constants, self._plan_rows, self._bias)
+        return self._known
 
     def _ready(self) -> kernels.Noise:
         """Noise of the sensors ahead."""
