@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.compensators import Compensator
-from baselines.compensation.policy import Action, ObservationView, Policy, resume
+from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
@@ -68,7 +68,7 @@ class Compensated:
         """
         rows, n = self._view.rows(observation), self._num_joints
         desired, compensator = self._view.motion(rows), self.compensator.at(rows)
-        memory, inner_state = resume(
+        memory, inner_state = taken_up(
             state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1 + n, 0)))
         )
         own = memory[:, 1 + n :]

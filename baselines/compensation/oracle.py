@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.compensators import DynamicCompensator
-from baselines.compensation.policy import Action, ObservationView, Policy, resume
+from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
@@ -58,7 +58,7 @@ class Oracle:
         truth, motion = self._env.truth(), self._view.motion(rows)
         n = motion.q.shape[-1]
         compensator = self._compensator.at(rows).with_stiffness(truth.stiffness)
-        memory, inner = resume(
+        memory, inner = taken_up(
             state, episode_start, rows, self._view,
             lambda: np.hstack([np.zeros((len(rows), 1 + n)), motion.q, compensator.begin(motion)]),
         )  # fmt: skip

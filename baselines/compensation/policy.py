@@ -107,7 +107,7 @@ class ObservationView:
         return "clock.time" if self._clock is not None else "a reference at rest, and no command yet"
 
 
-def resume(
+def taken_up(
     state: Any, episode_start: Any, rows: Array, view: ObservationView, begin: Callable[[], Array]
 ) -> tuple[Array, Any]:
     """Memory and inner state for this call, with the rows of new episodes begun afresh."""

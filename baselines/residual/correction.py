@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from baselines.compensation.policy import Action, ObservationView, Policy, resume
+from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray, IntArray
@@ -158,7 +158,7 @@ class Corrected:
         A residual that has been zero since the start of the episode gives the base's action to the last bit.
         """
         rows = self._view.rows(observation)
-        correction, inner = resume(
+        correction, inner = taken_up(
             state, episode_start, rows, self._view, lambda: np.zeros((len(rows), self._num_joints))
         )
         wanted = np.zeros_like(correction)

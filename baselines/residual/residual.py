@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, field_validator
 from safetensors.numpy import save
 
-from baselines.compensation.policy import Action, ObservationView, Policy, resume
+from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
 from baselines.residual.correction import Corrected, ResidualSettings
 from baselines.residual.evidence import caution
 from baselines.residual.features import Features
@@ -130,7 +130,7 @@ class ResidualPolicy:
     ) -> tuple[Action, Any]:
         """Corrected action and new state."""
         rows = self._view.rows(observation)
-        memory, inner = resume(state, episode_start, rows, self._view, lambda: self._undecided(len(rows)))
+        memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._undecided(len(rows)))
         due = np.flatnonzero((memory[:, 0] == 0.0) | (memory[:, 0] == _UNDECIDED))
         if len(due) > 0:
             memory = memory.copy()

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.policy import Action, ObservationView, resume
+from baselines.compensation.policy import Action, ObservationView, taken_up
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.biped import Biped
@@ -114,7 +114,7 @@ class WalkingController:
         """Offsets of the twelve joints [rad], and new state."""
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
-        memory, _ = resume(state, episode_start, rows, self._view, lambda: self._begin(frame))
+        memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(frame))
         steps, z, last, velocity, shift = memory[:, :1], memory[:, 1:2], memory[:, 2:6], memory[:, 6:8], memory[:, 8:]
         steps = steps + 1.0
         share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)

@@ -85,9 +85,9 @@ GROUNDS: dict[str, Scenario] = {
 _LONGEST_JOINED = 1000
 """Characters of a joined name that are looked at."""
 
-Change = Callable[[Scenario], dict[str, Any]]
+ScenarioChange = Callable[[Scenario], dict[str, Any]]
 
-CHANGES: dict[str, Change] = {
+CHANGES: dict[str, ScenarioChange] = {
     "soft": lambda _: {"stiffness_scale": 0.7},
     "stiff": lambda _: {"stiffness_scale": 1.3},
     "spread": lambda _: {"stiffness_spread": 0.3},

@@ -36,7 +36,7 @@ def _refuse(taken: set[str], what: str) -> None:
         raise ValueError(f"{name} cannot be {what}; {place}")
 
 
-Motion = Annotated[Any, AfterValidator(_reference)]
+GivenReference = Annotated[Any, AfterValidator(_reference)]
 """A `Reference`, checked when it is read."""
 
 
@@ -79,7 +79,7 @@ class Condition(Model):
     policy: PolicySpec
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
-    reference: Motion = "hold"
+    reference: GivenReference = "hold"
     """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
     or a mapping with `step_period` and further arguments of the environment."""
     label: str | None = None

@@ -62,7 +62,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Signal:
+class TracedSignal:
     """A traced signal in charts over time.
 
     Attributes:
@@ -128,7 +128,7 @@ class Environment:
     overview: Column
     swept: tuple[Column, ...]
     judged: tuple[Column, ...]
-    curves: tuple[Signal, ...]
+    curves: tuple[TracedSignal, ...]
     also: tuple[Column, ...] = ()
     splits: tuple[tuple[str, tuple[Column, ...]], ...] = ()
     learned_from: dict[str, Any] = field(default_factory=dict)
@@ -249,8 +249,8 @@ _TESTBED = Environment(
     swept=(Column("link error rms", "link_error_rms_rad"), Column("peak", "link_error_peak_rad")),
     judged=(Column("link error rms", "link_error_rms_rad"),),
     curves=(
-        Signal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
-        Signal("link error", "link_error", "mrad", 1e3),
+        TracedSignal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
+        TracedSignal("link error", "link_error", "mrad", 1e3),
     ),
 )  # fmt: skip
 
@@ -260,7 +260,10 @@ _JOINTS = replace(
     columns=tuple(column for column in _TESTBED.columns if not column.title.startswith("IMU")),
     traced=("time_s", "link_error", "deflection", "joint_torque", "command_rate"),
     figures=(),
-    curves=(Signal("link error", "link_error", "mrad", 1e3), Signal("deflection", "deflection", "mrad", 1e3)),
+    curves=(
+        TracedSignal("link error", "link_error", "mrad", 1e3),
+        TracedSignal("deflection", "deflection", "mrad", 1e3),
+    ),
 )
 """Several joints on a fixed base: the figures are those of all joints together."""
 
@@ -310,9 +313,9 @@ _WALKER = Environment(
     learned_from={"bank": 1},
     also=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
     curves=(
-        Signal("pelvis roll", "pelvis_roll", "mrad", 1e3),
-        Signal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
-        Signal("ZMP to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+        TracedSignal("pelvis roll", "pelvis_roll", "mrad", 1e3),
+        TracedSignal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
+        TracedSignal("ZMP to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
     ),
     quantity="step period",
     failure="falls",

@@ -16,7 +16,7 @@ from rich.table import Table
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.cells import run_conditions
-from train.evaluate.conditions import Condition, Motion, PolicySpec
+from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import Evaluation
 from train.runs.escaping import markdown_table
@@ -35,7 +35,7 @@ class BenchCase(Model):
     policy: Locator
     """A baseline, residual:PATH, "FILE.py:function" or "module:function"."""
     scenario: Title = "nominal"
-    reference: Motion | None = None
+    reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2, description="seed of the episode")
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)

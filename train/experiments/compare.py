@@ -12,7 +12,7 @@ from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, qu
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from train.evaluate.cells import CellsFailedError, run_conditions
 from train.evaluate.changes import changes, merged
-from train.evaluate.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
+from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, PolicySpec
 from train.evaluate.environments import Environment, Reference, environment
 from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
 from train.evaluate.families import expand
@@ -44,7 +44,7 @@ class CompareConfig(Model):
     name: str = Field(pattern=r"^[\w.-]*\w$", max_length=100)
     """Name of the result folder under runs/: letters, digits, dots, dashes."""
     env: str = "testbed"
-    references: list[Motion] = Field(min_length=1, max_length=MOST_ENTRIES)
+    references: list[GivenReference] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Motions, see `Condition.reference`; default the environment's."""
     scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
     policies: list[PolicySpec] = Field(

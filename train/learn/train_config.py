@@ -12,7 +12,7 @@ from baselines.residual.residual import ResidualDescription, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, shown
-from train.evaluate.conditions import MOST_EPISODES, Condition, Motion, PolicySpec
+from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
 from train.learn.mixed_env import mixed_env
 from train.runs.kinds import is_a
@@ -33,7 +33,7 @@ class TrainConfig(Model):
 
     name: Title = "train"
     env: str = "walker"
-    reference: Motion | None = None
+    reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
     """Scenarios whose worlds are learned from together, in equal shares."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from train.evaluate.changes import level
-from train.evaluate.environments import Column, Signal
+from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.progress import Curves
 from train.figures.plots import line_style
@@ -151,7 +151,7 @@ def learning(curves: Mapping[str, Curves], columns: Sequence[Column], colour: Ma
     return Chart({"data": data, "layout": layout}, 400)
 
 
-def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: Signal, stride: int, where: Spec, first: bool
+def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: TracedSignal, stride: int, where: Spec, first: bool
             ) -> list[Spec]:  # fmt: skip
     """A line, and of several training seeds the band around it."""
     length = max(len(e.trace["time_s"]) for e in cell)

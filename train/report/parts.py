@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.signals import Array
-from train.evaluate.environments import Column, Environment, Signal
+from train.evaluate.environments import Column, Environment, TracedSignal
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.statistics import Estimate
 from train.figures.plots import colours
@@ -91,7 +91,7 @@ def band_between(low: Array, high: Array, colour: str, where: Spec, title: str) 
     ]
 
 
-def range_of(evaluations: Sequence[Evaluation], signal: Signal) -> list[float]:
+def range_of(evaluations: Sequence[Evaluation], signal: TracedSignal) -> list[float]:
     """Range of a signal and its reference, shortly before a fall left out."""
     found = []
     for e in evaluations:

@@ -26,7 +26,7 @@ _SETTLE_S = 0.5
 
 
 @dataclass(frozen=True)
-class Timing:
+class CycleTiming:
     """How well the last control period was kept; counts are of the episode."""
 
     jitter_s: float = 0.0
@@ -79,7 +79,7 @@ class ServoPlant:
         self.act: Array = np.zeros((1, model.na))
         self.ctrl: Array = np.zeros((1, model.nu))
         self.motor_torque = np.full(1, np.nan)
-        self.timing = Timing()
+        self.timing = CycleTiming()
         self._at, self._period_s, self._pendulum_nm = at, period_s, pendulum_nm
         self._bus: SupervisedBus | None = None
         self._imu: AttitudeStream | None = None
@@ -110,7 +110,7 @@ class ServoPlant:
             self._restart_clock()
             self._move(start, angle)
             self._cycles(angle, _SETTLE_S)
-            self.timing = Timing()
+            self.timing = CycleTiming()
             bus.keep(self._servo_goal(angle))
             self._is_kept = True
 
@@ -254,7 +254,7 @@ class ServoPlant:
             missed += 1
         self._take(cycle)
         last = self.timing
-        self.timing = Timing(
+        self.timing = CycleTiming(
             jitter_s=late_s,
             period_s=cycle.states.time_s - self._read_s,
             overruns=last.overruns + overruns,

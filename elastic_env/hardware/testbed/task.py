@@ -10,7 +10,7 @@ What differs, because a real joint does not tell it:
 | `truth()`, and with it the policy `oracle` | an error |
 
 Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies` and `limited`, see
-`elastic_env.hardware.testbed.plant.Timing`.
+`elastic_env.hardware.testbed.plant.CycleTiming`.
 """
 
 from collections.abc import Sequence

@@ -19,7 +19,7 @@ Records: TypeAlias = npt.NDArray[Any]
 """An array of one of these types, one row per world."""
 
 REAL, WHOLE = np.float64, np.int64
-JOINTS = len(LEG_JOINTS)
+NUM_JOINTS = len(LEG_JOINTS)
 
 
 def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
@@ -31,11 +31,11 @@ _FEET_WRENCH = (2, 2, 3)  # feet, force and moment, axes
 
 TRUTH = record_type(
     ("step", WHOLE),  # control steps since the start of the episode
-    ("theta", REAL, JOINTS), ("theta_dot", REAL, JOINTS),  # motor side [rad], [rad/s]
-    ("q", REAL, JOINTS), ("q_dot", REAL, JOINTS),  # link side [rad], [rad/s]
-    ("servo_torque", REAL, JOINTS),  # [N·m]
-    ("stiffness", REAL, JOINTS),  # true K [N·m/rad]
-    ("offset", REAL, JOINTS), ("command", REAL, JOINTS),  # a, and θ_cmd = q_ref + a [rad]
+    ("theta", REAL, NUM_JOINTS), ("theta_dot", REAL, NUM_JOINTS),  # motor side [rad], [rad/s]
+    ("q", REAL, NUM_JOINTS), ("q_dot", REAL, NUM_JOINTS),  # link side [rad], [rad/s]
+    ("servo_torque", REAL, NUM_JOINTS),  # [N·m]
+    ("stiffness", REAL, NUM_JOINTS),  # true K [N·m/rad]
+    ("offset", REAL, NUM_JOINTS), ("command", REAL, NUM_JOINTS),  # a, and θ_cmd = q_ref + a [rad]
     ("command_rate", REAL),  # rms over the joints of the change of a [rad/s]
     ("pelvis", REAL, 3), ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
     ("pelvis_rate", REAL, 3),  # in the frame of the pelvis [rad/s]
@@ -49,7 +49,7 @@ TRUTH = record_type(
 """What the physics did in a control step."""
 
 MEASURED = record_type(
-    ("encoder", REAL, JOINTS), ("encoder_before", REAL, JOINTS),  # now and one control step ago [rad]
+    ("encoder", REAL, NUM_JOINTS), ("encoder_before", REAL, NUM_JOINTS),  # now and one control step ago [rad]
     ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
     ("wrench", REAL, _FEET_WRENCH),  # as in the truth
 )  # fmt: skip
@@ -58,7 +58,7 @@ MEASURED = record_type(
 NOISE = record_type(("imu_attitude", REAL, 2), ("imu_rate", REAL, 3), ("wrench", REAL, _FEET_WRENCH))
 """Standard normal samples of a control step [1]."""
 
-BIAS = record_type(("encoder", REAL, JOINTS), ("imu_attitude", REAL, 2))
+BIAS = record_type(("encoder", REAL, NUM_JOINTS), ("imu_attitude", REAL, 2))
 """Errors of homing and mounting, drawn per episode [rad]."""
 
 SCORES = record_type(("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL))
@@ -68,7 +68,7 @@ STEP = record_type(("truth", TRUTH), ("measured", MEASURED), ("scores", SCORES))
 """A control step of a world."""
 
 ROW_OF_PLAN = record_type(
-    ("q", REAL, JOINTS), ("q_dot", REAL, JOINTS), ("q_ddot", REAL, JOINTS),  # [rad], [rad/s], [rad/s²]
+    ("q", REAL, NUM_JOINTS), ("q_dot", REAL, NUM_JOINTS), ("q_ddot", REAL, NUM_JOINTS),  # [rad], [rad/s], [rad/s²]
     ("clock", REAL, 3), ("share", REAL), ("zmp", REAL, 2),  # time, swing, support; μ; [m]
     ("half_of_swing", WHOLE), ("swing_foot", WHOLE),
     ("imu_is_due", np.bool_), ("weight", REAL),  # factor of tilt and zmp in the reward
@@ -93,8 +93,8 @@ RULES = record_type(
 """Numbers that judge a control step."""
 
 ADDRESSES = record_type(
-    ("theta", WHOLE, JOINTS), ("q", WHOLE, JOINTS),  # in qpos
-    ("theta_dot", WHOLE, JOINTS), ("q_dot", WHOLE, JOINTS),  # in qvel
+    ("theta", WHOLE, NUM_JOINTS), ("q", WHOLE, NUM_JOINTS),  # in qpos
+    ("theta_dot", WHOLE, NUM_JOINTS), ("q_dot", WHOLE, NUM_JOINTS),  # in qvel
     ("ankles", WHOLE, 2),  # among the sites
 )  # fmt: skip
 """Where the joints stand in the physics; the pelvis comes first."""
@@ -107,11 +107,12 @@ CONSTANTS = record_type(
 """What does not change."""
 
 OBSERVED = record_type(
-    ("encoder_angle", REAL, JOINTS), ("encoder_rate", REAL, JOINTS),
+    ("encoder_angle", REAL, NUM_JOINTS), ("encoder_rate", REAL, NUM_JOINTS),
     ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3), ("wrench", REAL, _FEET_WRENCH),
-    ("reference_angle", REAL, JOINTS), ("reference_rate", REAL, JOINTS), ("reference_acceleration", REAL, JOINTS),
+    ("reference_angle", REAL, NUM_JOINTS), ("reference_rate", REAL, NUM_JOINTS),
+    ("reference_acceleration", REAL, NUM_JOINTS),
     ("clock", REAL, 3), ("load_share", REAL), ("zmp_reference", REAL, 2),
-    ("last_command", REAL, JOINTS),
+    ("last_command", REAL, NUM_JOINTS),
 )  # fmt: skip
 """Columns of the observation, see `elastic_env.robots.thormang.task`."""
 
