@@ -151,8 +151,8 @@ def learning(curves: Mapping[str, Curves], columns: Sequence[Column], colour: Ma
     return Chart({"data": data, "layout": layout}, 400)
 
 
-def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: TracedSignal, stride: int, where: Spec, first: bool
-            ) -> list[Spec]:  # fmt: skip
+def _curves(title: str, colour: str, cell: Sequence[Evaluation], signal: TracedSignal, stride: int, where: Spec,
+            first: bool) -> list[Spec]:  # fmt: skip
     """A line, and of several training seeds the band around it."""
     length = max(len(e.trace["time_s"]) for e in cell)
     padded = np.full((len(cell), length), np.nan)
