@@ -27,7 +27,7 @@ LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: {[1]: 2}", "name of a parameter must be text, got a sequence"),
         ("on: 2", "name of a parameter must be text, got True"),
         ('a: "\\0"', "zero bytes"),
-        ('a: "\\ud800"', "halves of characters"),
+        ('a: "\\ud800"', "invalid Unicode character escape code"),
     ],
 )
 def test_what_is_beyond_the_limits_is_refused_at_once(text: str, message: str) -> None:
