@@ -18,6 +18,7 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from train.runs.failures import explained
 from train.runs.workers import WorkerKilledError, duration, plain_progress
 
+CONFIGS = Path(__file__).parents[1] / "configs"
 POLICIES = """
 import numpy as np
 class Policy:
@@ -176,3 +177,35 @@ def test_long_work_is_announced(whole_s: float, first: str, monkeypatch: pytest.
         now = whole_s * percent / 100.0
         say(percent / 100.0)
     assert out.getvalue().splitlines()[0] == first
+
+
+BLOCKED = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "stable_baselines3", "imageio", "matplotlib"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Blocked())
+from train.commands.entry import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (["train", "train_testbed.yaml"], "train"),
+        (["speed", "--env", "testbed"], "train"),
+        (["export", "x.zip", "train_testbed.yaml"], "train"),
+        (["play", "--video", "x.mp4"], "report"),
+    ],
+)
+def test_an_extra_that_is_not_installed_is_one_sentence(arguments: list[str], extra: str, tmp_path: Path) -> None:
+    """Catches a traceback, of this process or of one that it started before it looked."""
+    given = [str(CONFIGS / name) if name.endswith(".yaml") else name for name in arguments]
+    run = subprocess.run(
+        [sys.executable, "-c", BLOCKED, *given], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert run.returncode == 2, run.stderr
+    assert f"pip install -c constraints.txt '.[{extra}]'" in run.stderr
+    assert "Traceback" not in run.stderr

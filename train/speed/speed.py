@@ -1,6 +1,7 @@
 """Throughput in one interleaved run: our vector environment against raw `mj_step`, scalar environments, and PPO."""
 
 import cProfile
+import importlib
 import json
 import os
 import pstats
@@ -181,8 +182,11 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
 
     Raises:
         ConfigurationError: Environment or policy does not exist; found before the work begins.
+        ModuleNotFoundError: Stable-Baselines3 is not installed, and a contender needs it; found before, too.
         ResultsExistError: The output folder holds results.
     """
+    if config.others or config.ppo:
+        importlib.import_module("stable_baselines3")
     VectorLoop(config.env, 1, 1, config.policy)
     with run_folder("speed", config.model_dump(mode="json"), None, output) as folder:
         console.print("measuring every contender in turn, round by round")
