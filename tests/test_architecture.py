@@ -94,6 +94,8 @@ def test_rooms_import_only_from_those_before(file: Path) -> None:
     used = {room_of(name) for name in imported(file) if name.split(".")[0] in PACKAGES}
     used -= {"elastic_env", "train"} if file.name != "__init__.py" else set()  # whose import registers, or is of names
     assert {room for room in used if ROOMS.index(room) > ROOMS.index(own)} == set()
+    if own.startswith("baselines"):
+        assert not {room for room in used if room.startswith("elastic_env.robots.")}, "a policy for one robot"
     if own not in ("elastic_env.robots.testbed", "elastic_env.robots.thormang"):
         return
     assert not {room for room in used if room.startswith("elastic_env.robots.")} - {own}, "robots know one another"

@@ -27,7 +27,7 @@ def observed(scenario: str, num_envs: int = 2) -> Array:
     env = walker(scenario, num_envs)
     policy, observer = baselines.make("input_output", env), BendingObserver(env.unwrapped.assumed_model)
     (observation, _), state, memory = env.reset(seed=5), None, observer.begin(num_envs)
-    estimates = np.zeros((num_envs, len(observer.names)))
+    estimates = np.zeros((num_envs, len(observer.signals)))
     for step in range(env.unwrapped.task.num_steps - 1):
         if step % 25 == 0:
             estimates, memory = observer.observe(observation, memory)

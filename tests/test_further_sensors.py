@@ -132,8 +132,8 @@ def test_the_names_of_sensors_are_told() -> None:
 def test_the_mirror_knows_every_sensor() -> None:
     """Catches a declaration without its mirror image: in the mirror the truth of the mirrored robot is shown."""
     env = made("elastic_env/WalkInPlace-v0")
-    table, biped = env.unwrapped.task.observation_table, env.unwrapped.assumed_model.biped
-    mirrored = Mirror(table.names, biped)
+    table = env.unwrapped.task.observation_table
+    mirrored = Mirror(table.signals)
     row = np.arange(1.0, len(table) + 1.0)
     seen = mirrored(row)
     np.testing.assert_array_equal(mirrored(seen), row)

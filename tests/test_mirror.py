@@ -11,7 +11,7 @@ from baselines.residual.correction import Corrected, ResidualSettings
 from baselines.residual.features import Features
 from baselines.residual.mirror import Mirror
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, SignalTable
 from elastic_env.runtime.robot_model import WalkerModel
 
 MODEL_SPACE: dict[str, Any] = {"shared": True, "decision_period": 1}
@@ -68,7 +68,7 @@ def test_a_step_on_the_right_foot_is_one_on_the_left_in_the_mirror(walk: tuple[A
     support = rows[:, table.columns("clock.support")][:, 0]
     first, second, third = np.flatnonzero(np.diff(support))[:3] + 1
     assert second - first == third - second  # equally long
-    one, other = rows[first:second], Mirror(table.names, model_of(env).biped)(rows[second:third])
+    one, other = rows[first:second], Mirror(table.signals)(rows[second:third])
     planned = [name for name in table.names if name.split(".")[0] in {"reference_angle", "load_share", "zmp_reference"}]
     columns = np.array([table.names.index(name) for name in planned])
     assert np.ptp(one[:, columns], axis=0).max() > 0.1
@@ -87,11 +87,11 @@ def test_what_a_residual_sees_of_a_mirrored_walk_is_the_mirror_image() -> None:
     model, rows = model_of(env), walked(env)[::20]
     observe = ("observation", "encoder_error", "contact_error", "level", "bending", "base_action")
     features, seen = features_of(env, rows, observe=observe)
-    _, reflected = features_of(env, Mirror(model.observation_table.names, model.biped)(rows), observe=observe)
-    expected = Mirror(features.names, model.biped)(seen)
+    _, reflected = features_of(env, Mirror(model.observation_table.signals)(rows), observe=observe)
+    expected = Mirror(features.signals)(seen)
     assert np.abs(reflected - seen).max(axis=0).astype(bool).mean() > 0.6  # not by leaving all as it is
     bound = 1e-6 * (1.0 + np.abs(seen).max(axis=0))  # commands are float32
-    assert (np.abs(reflected - expected) <= bound).all(), np.array(features.names)[
+    assert (np.abs(reflected - expected) <= bound).all(), np.array(features.signals)[
         (np.abs(reflected - expected) > bound).any(axis=0)
     ]
 
@@ -106,12 +106,12 @@ def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step
     right = rows[:, model.observation_table.columns("clock.support")][:, 0] == 1.0
     assert 5 < right.sum() < len(rows) - 5
     np.testing.assert_array_equal(seen[~right], plain[~right])
-    np.testing.assert_array_equal(seen[:, features.names.index("clock.support")], 0.0)
-    width = len(features.names)
-    np.testing.assert_array_equal(seen[right, :width], Mirror(features.names, model.biped)(plain[right, :width]))
-    measured = [name for name in features.names if name.startswith(("encoder_angle.", "wrench."))]
+    np.testing.assert_array_equal(seen[:, SignalTable(features.signals).names.index("clock.support")], 0.0)
+    width = len(features.signals)
+    np.testing.assert_array_equal(seen[right, :width], Mirror(features.signals)(plain[right, :width]))
+    measured = [one for one in features.signals if one.name.startswith(("encoder_angle.", "wrench."))]
     earlier = plain[right, width:].reshape(right.sum(), 2, len(measured))
-    expected = Mirror(measured, model.biped)(earlier).reshape(right.sum(), -1)
+    expected = Mirror(measured)(earlier).reshape(right.sum(), -1)
     np.testing.assert_array_equal(seen[right, width:], expected)
 
 

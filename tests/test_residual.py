@@ -398,7 +398,7 @@ def test_residuals_see_what_they_are_told_to() -> None:
     for decision in range(5):
         fresh = np.array([decision in (0, 3), decision == 0])
         seen, memory = features.at(rows[decision], memory, fresh, None, None)
-    assert seen.shape == (2, features.width) == (2, 3 + 2 + len(BendingObserver.names) + 2 * 3)
+    assert seen.shape == (2, features.width) == (2, 3 + 2 + len(BendingObserver.signals) + 2 * 3)
     np.testing.assert_array_equal(seen[:, :3], rows[4][:, rates])
     np.testing.assert_array_equal(seen[:, [3]], rows[4][:, table.group("clock.swing")])
     np.testing.assert_array_equal(seen[:, [4]], rows[4][:, table.group("load_share")])

@@ -16,7 +16,7 @@ squares over the time that a foot is loaded tell ρ from c, for roll and pitch o
 import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -26,7 +26,8 @@ MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
 """Standard deviations before the first measurement, of ρ and c, and of a measurement."""
 
 _UNKNOWNS = 2  # ρ and c
-_FILTERS = (2, 2)  # legs, roll and pitch
+_SHAPE = (2, 2)  # legs, roll and pitch
+_FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"))
 _ESTIMATE, _VARIANCES = 8, 12  # per world: (legs, axes, unknowns) and (legs, axes, upper triangle)
 
 
@@ -39,12 +40,16 @@ class BendingObserver:
         model: Assumed walker.
     """
 
-    names = (
-        *(f"model_error.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
-        *(f"uncertainty.{side}_{axis}" for side in "lr" for axis in ("roll", "pitch")),
-        "excess_load",
+    signals = tuple(
+        Signal(f"{name}{filtered}", "1", meaning, mirrored="same")
+        for name, meaning, filters in (
+            ("model_error", "relative error ρ of a leg's model", _FILTERS),
+            ("uncertainty", "its standard deviation", _FILTERS),
+            ("excess_load", "measured over assumed load, less one", ("",)),
+        )
+        for filtered in filters
     )
-    """What `observe` returns: ρ and its standard deviation, and measured over assumed load less one [1]."""
+    """What `observe` returns."""
     memory_width = _ESTIMATE + _VARIANCES
 
     def __init__(self, model: WalkerModel) -> None:
@@ -62,7 +67,7 @@ class BendingObserver:
         return memory
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Estimates after a measurement, see `names`, and the new memory.
+        """Estimates after a measurement, see `signals`, and the new memory.
 
         Args:
             rows: Observations, (num_worlds, m).
@@ -73,7 +78,7 @@ class BendingObserver:
         loaded: BoolArray = np.asarray(force[..., 2] >= LOADED_SHARE * self._carried)
         estimate, variances = np.split(memory, [_ESTIMATE], axis=1)
         seen, expected = self.disagreement(rows, self.bending(rows))
-        x, P = estimate.reshape(n, *_FILTERS, _UNKNOWNS), _symmetric(variances.reshape(n, *_FILTERS, 3))
+        x, P = estimate.reshape(n, *_SHAPE, _UNKNOWNS), _symmetric(variances.reshape(n, *_SHAPE, 3))
         x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
         upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
         excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0

@@ -26,7 +26,7 @@ On two feet that is too much about x, where a leaning weight goes from one foot 
 import numpy as np
 
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, renamed
 from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -48,17 +48,14 @@ class GroundLevel:
         mean_s: Time constant of the mean, after as much time [s].
     """
 
-    names = (
-        "own_tilt.roll",
-        "own_tilt.pitch",
-        *(f"level_wrench.{side}_{part}{axis}" for side in "lr" for part in "fm" for axis in "xyz"),
-    )
-    """What `observe` returns: [rad], [N] and [N·m], the wrenches in the order of the observation."""
     memory_width = 1 + 2 + 2
 
     def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
         table = model.observation_table
         self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
+        attitude, wrench = table.signals_of("imu_attitude"), table.signals_of("wrench")
+        self.signals = (*renamed(attitude, "own_tilt"), *renamed(wrench, "level_wrench"))
+        """What `observe` returns."""
         self._theta, self._rate = table.group("encoder_angle"), table.group("encoder_rate")
         self._carried, self._bending = model.biped.chains_above_feet, BendingObserver(model)
         self._least_n = LOADED_SHARE * model.biped.weight
@@ -72,7 +69,7 @@ class GroundLevel:
         return memory
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Values after a measurement, see `names`, and the new memory.
+        """Values after a measurement, see `signals`, and the new memory.
 
         Args:
             rows: Observations, (num_worlds, m).

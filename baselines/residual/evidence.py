@@ -16,8 +16,7 @@ import numpy as np
 
 from baselines.estimation.bending import BendingObserver
 from baselines.residual.correction import Corrected
-from elastic_env.core.signals import Array
-from elastic_env.robots.thormang.model import SIDES
+from elastic_env.core.signals import Array, SignalTable
 from elastic_env.runtime.robot_model import WalkerModel
 
 ERROR_SCALE, LOAD_SCALE = 0.1, 0.05
@@ -25,10 +24,9 @@ ERROR_SCALE, LOAD_SCALE = 0.1, 0.05
 PRIOR_S = 0.5
 """Time for which the assumed load counts in the mean [s]: a robot that steps presses with more and with less."""
 
-_ERROR, _UNCERTAINTY = (
-    [BendingObserver.names.index(f"{group}.{side}_roll") for side in SIDES] for group in ("model_error", "uncertainty")
-)
-_LOAD = BendingObserver.names.index("excess_load")
+_SEEN = SignalTable(BendingObserver.signals)
+_ERROR, _UNCERTAINTY = (_SEEN.columns(f"{group}.l_roll", f"{group}.r_roll") for group in ("model_error", "uncertainty"))
+_LOAD = _SEEN.names.index("excess_load")
 
 
 class Evidence:

@@ -21,13 +21,11 @@ from baselines.estimation.ground_level import GroundLevel
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.ground_contact import FootSensors, zero_moment_point
-from elastic_env.robots.thormang.model import SIDES
+from elastic_env.core.signals import Array, BoolArray, Signal, renamed
+from elastic_env.dynamics.ground_contact import zero_moment_point
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 OBSERVATION, BASE_ACTION = "observation", "base_action"
-_MEASUREMENTS = ("encoder_angle", "encoder_rate", "imu_attitude", "imu_rate", "wrench", "link_angle_imu")
 
 
 class Source(Protocol):
@@ -36,8 +34,8 @@ class Source(Protocol):
     memory_width: int
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """What its features are, as in the table of the observation."""
+    def signals(self) -> tuple[Signal, ...]:
+        """What its features are."""
         ...
 
     def begin(self, num_worlds: int) -> Array:
@@ -45,7 +43,7 @@ class Source(Protocol):
         ...
 
     def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Features of observations, (num_worlds, m) to (num_worlds, names), and the new memory."""
+        """Features of observations, (num_worlds, m) to (num_worlds, signals), and the new memory."""
         ...
 
 
@@ -67,18 +65,17 @@ class Features:
         period_s = settings.decision_period * model.control_period_s
         self._sources = [_source(name, model, period_s) for name in names]
         self._acts = BASE_ACTION in settings.observe
-        widths = np.array([len(source.names) for source in self._sources], dtype=np.int64)
-        is_measured = np.repeat([name.split(".")[0] in _MEASUREMENTS for name in names], widths)
-        self._measured, self._history = np.flatnonzero(is_measured), settings.history
+        seen = [signal for source in self._sources for signal in source.signals]
+        self._measured = np.array([i for i, signal in enumerate(seen) if signal.kind == "measured"], dtype=np.int64)
+        self._history = settings.history
         past = self._history * len(self._measured)
         self._ends = np.cumsum([past, *(source.memory_width for source in self._sources)])
-        seen = [name for source in self._sources for name in source.names]
-        commanded = [f"{BASE_ACTION}.{joint}" for joint in model.joint_names] if self._acts else []
-        self.names = (*seen, *commanded)
-        self.width = len(self.names) + past
+        commands = renamed(model.observation_table.signals_of("last_command"), BASE_ACTION) if self._acts else ()
+        self.signals = (*seen, *commands)
+        self.width = len(self.signals) + past
         self.memory_width = int(self._ends[-1])
         measured = [seen[i] for i in self._measured]
-        self._mirror = LeftFirst(self.names, measured, corrected) if settings.mirror else None
+        self._mirror = LeftFirst(self.signals, measured, corrected) if settings.mirror else None
 
     def at(
         self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
@@ -130,7 +127,7 @@ def _named(observe: tuple[str, ...], model: RobotModel) -> list[str]:
 def _source(name: str, model: RobotModel, period_s: float) -> Source:
     if name in _groups(model) or name in model.observation_table.names:
         group = model.observation_table.group(name)
-        return _Instant(model.observation_table.names[group], lambda rows: rows[:, group])
+        return _Instant(model.observation_table.signals[group], lambda rows: rows[:, group])
     if name == "encoder_error":
         return _encoder_error(model)
     if isinstance(model, WalkerModel) and name == "contact_error":
@@ -148,8 +145,8 @@ class _Instant:
 
     memory_width = 0
 
-    def __init__(self, names: tuple[str, ...], function: Callable[[Array], Array]) -> None:
-        self.names, self._function = names, function
+    def __init__(self, signals: tuple[Signal, ...], function: Callable[[Array], Array]) -> None:
+        self.signals, self._function = signals, function
 
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 0))
@@ -159,9 +156,10 @@ class _Instant:
 
 
 def _encoder_error(model: RobotModel) -> _Instant:
-    encoder, reference = (model.observation_table.group(name) for name in ("encoder_angle", "reference_angle"))
-    names = tuple(f"encoder_error.{joint}" for joint in model.joint_names)
-    return _Instant(names, lambda rows: rows[:, encoder] - rows[:, reference])
+    table = model.observation_table
+    encoder, reference = (table.group(name) for name in ("encoder_angle", "reference_angle"))
+    errors = renamed(table.signals_of("encoder_angle"), "encoder_error")
+    return _Instant(errors, lambda rows: rows[:, encoder] - rows[:, reference])
 
 
 class _ContactError:
@@ -171,7 +169,11 @@ class _ContactError:
     for a ZMP.
     """
 
-    names = ("contact_error.x", "contact_error.y", "contact_error.share")
+    signals = (
+        Signal("contact_error.x", "m", "ZMP less the planned one, forward", mirrored="same"),
+        Signal("contact_error.y", "m", "likewise, to the left", mirrored="opposite"),
+        Signal("contact_error.share", "1", "share of the load on the right foot, likewise", mirrored="opposite"),
+    )
     _LEAST_N = 50.0
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
@@ -179,9 +181,7 @@ class _ContactError:
         self._level = GroundLevel(model, period_s)
         self.memory_width = self._level.memory_width
         self._share, self._zmp = table.group("load_share"), table.group("zmp_reference")
-        rigid = biped.rigid
-        feet = [rigid.body(f"{side}_foot").id for side in SIDES]
-        self._sensors = FootSensors(rigid.body_mass[feet], rigid.body_ipos[feet], rigid.opt.gravity)
+        self._sensors = biped.foot_sensors
         self._ankles = biped.ankles
 
     def begin(self, num_worlds: int) -> Array:

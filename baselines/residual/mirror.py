@@ -15,44 +15,10 @@ import numpy as np
 
 from baselines.residual.correction import Corrected
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
-from elastic_env.runtime.further_sensors import SENSORS
+from elastic_env.core.signals import Array, Signal
 from elastic_env.runtime.robot_model import WalkerModel
 
-_SHARES = {"clock.support", "load_share"}
-"""0 on the left, 1 on the right."""
-_ODD = {
-    "imu_attitude.roll",
-    "own_tilt.roll",
-    "imu_rate.x",
-    "imu_rate.z",
-    "zmp_reference.y",
-    "contact_error.y",
-    "contact_error.share",
-    *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fy", "mx", "mz")),
-}
-"""What changes its sign, but for the sides in the names."""
-_EVEN = {
-    "imu_attitude.pitch",
-    "own_tilt.pitch",
-    "imu_rate.y",
-    "zmp_reference.x",
-    "contact_error.x",
-    "clock.time",
-    "clock.swing",
-    "excess_load",
-    *(f"{group}.{part}" for group in ("wrench", "level_wrench") for part in ("fx", "fz", "my")),
-    *(f"{group}.{axis}" for group in ("model_error", "uncertainty") for axis in ("roll", "pitch")),
-}
-"""What keeps it."""
-_OF_SENSORS = {
-    f"{name}.{axis}": sign
-    for name, sensor in SENSORS.items()
-    for axis, sign in zip(sensor.axes, sensor.mirrored, strict=True)
-}
-"""What the columns of further sensors are, by their declarations."""
-_LATERAL_AXES = (0, 2)
+_SIGN = {"same": 1.0, "opposite": -1.0, "complement": -1.0}
 _SIDE = re.compile(r"(?<=\.)[lr]_")
 
 
@@ -60,31 +26,23 @@ class Mirror:
     """What signals of a walker are in its mirror.
 
     Args:
-        names: What the columns hold, as in the tables of observations and features; joints after a dot.
-        biped: The robot.
+        signals: What the columns hold, with the sides l_ and r_ behind a dot.
 
     Raises:
-        ConfigurationError: A name of which it is not known what it is in the mirror, or one of a side alone.
+        ConfigurationError: A signal of which nobody has said what it is in the mirror, or one of a side alone.
     """
 
-    def __init__(self, names: Sequence[str], biped: Biped) -> None:
-        lateral = {
-            name
-            for leg in np.split(np.array(biped.joint_names), 2)
-            for name, axis in zip(leg.tolist(), biped.chains.axis, strict=True)
-            if axis in _LATERAL_AXES
-        }
-        joints = set(biped.joint_names)
-        columns = {name: column for column, name in enumerate(names)}
-        lacking = [_other_side(name) for name in names if _other_side(name) not in columns]
-        if lacking:
+    def __init__(self, signals: Sequence[Signal]) -> None:
+        columns = {signal.name: column for column, signal in enumerate(signals)}
+        others = [_other_side(name) for name in columns]
+        if lacking := [name for name in others if name not in columns]:
             raise ConfigurationError(
                 f"in the mirror left and right change places, but there is no {', '.join(lacking)}; observe both, or "
                 "mirror: false"
             )
-        self._source = np.array([columns[_other_side(name)] for name in names], dtype=np.int64)
-        self._sign = np.array([_sign(name, joints, lateral) for name in names])
-        self._offset = np.array([float(name in _SHARES) for name in names])
+        self._source = np.array([columns[name] for name in others], dtype=np.int64)
+        self._sign = np.array([_sign(signal) for signal in signals])
+        self._offset = np.array([float(signal.mirrored == "complement") for signal in signals])
 
     def __call__(self, values: Array) -> Array:
         """Values in the mirror, (..., columns)."""
@@ -95,15 +53,15 @@ class LeftFirst:
     """Shows steps on the right foot in the mirror, as steps on the left.
 
     Args:
-        names: Of the features, earlier measurements left out.
-        measured: Of the measurements of one earlier decision.
+        signals: The features, earlier measurements left out.
+        measured: The measurements of one earlier decision.
         corrected: The base and its correction, which is the same in the mirror.
 
     Raises:
-        ConfigurationError: No walker, a name without a mirror image, or a joint corrected unlike the other leg's.
+        ConfigurationError: No walker, a signal without a mirror image, or a joint corrected unlike the other leg's.
     """
 
-    def __init__(self, names: Sequence[str], measured: Sequence[str], corrected: Corrected) -> None:
+    def __init__(self, signals: Sequence[Signal], measured: Sequence[Signal], corrected: Corrected) -> None:
         model, settings = corrected.model, corrected.settings
         if not isinstance(model, WalkerModel):
             raise ConfigurationError(
@@ -119,8 +77,8 @@ class LeftFirst:
                 f"mirror needs joints and scale that are the same on both legs, they are not for {', '.join(unlike)}; "
                 "name joints without l_ and r_, or mirror: false"
             )
-        self._now, self._past = Mirror(names, model.biped), Mirror(measured, model.biped)
-        self._split, self._earlier = len(names), (settings.history, len(measured))
+        self._now, self._past = Mirror(signals), Mirror(measured)
+        self._split, self._earlier = len(signals), (settings.history, len(measured))
         self._support = model.observation_table.columns("clock.support")
 
     def __call__(self, rows: Array, features: Array) -> Array:
@@ -143,14 +101,9 @@ def _other_side(name: str) -> str:
     return _SIDE.sub(lambda side: "r_" if side[0] == "l_" else "l_", name)
 
 
-def _sign(name: str, joints: set[str], lateral: set[str]) -> float:
-    joint, plain = name.rpartition(".")[2], _SIDE.sub("", name)
-    if joint in joints:
-        return -1.0 if joint in lateral else 1.0
-    if plain in _OF_SENSORS:
-        return _OF_SENSORS[plain]
-    if plain in _EVEN:
-        return 1.0
-    if plain in _ODD or plain in _SHARES:
-        return -1.0
-    raise ConfigurationError(f"it is not known what {name!r} is in the mirror; leave it out, or mirror: false")
+def _sign(signal: Signal) -> float:
+    if signal.mirrored is None:
+        raise ConfigurationError(
+            f"it is not known what {signal.name!r} is in the mirror; leave it out, or mirror: false"
+        )
+    return _SIGN[signal.mirrored]

@@ -1,8 +1,8 @@
 """Named arrays that know their units: the one description of what an observation or an action holds."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,17 +18,78 @@ Parameter: TypeAlias = Array | float
 """A parameter that is broadcast against an array: one number, or one per joint."""
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
+Kind: TypeAlias = Literal["measured", "reference", "command"]
+Mirrored: TypeAlias = Literal["same", "opposite", "complement"]
+"""What a value p is where left and right change places: p, −p, or 1 − p as of a share."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One scalar of an observation or action: name, unit, meaning, and the values it can take."""
+    """One scalar of an observation or action.
+
+    Attributes:
+        name, unit, meaning: In words.
+        low, high: Values that it can take.
+        kind: Whether sensors show it, the plan has it, or it was commanded; None for what follows from these.
+        mirrored: What it is in the mirror; None where nobody has said so.
+    """
 
     name: str
     unit: str
     meaning: str
     low: float = -np.inf
     high: float = np.inf
+    kind: Kind | None = None
+    mirrored: Mirrored | None = None
+
+
+@dataclass(frozen=True)
+class SignalGroup:
+    """Signals that are read together: neighbours in the observation, one field of a structured row.
+
+    Attributes:
+        name: Of the field. Its columns are called `name.part`, a single one has the name alone.
+        signals: Its columns.
+        shape: Of the field.
+        noise: Standard deviation of each column in a scenario, one number or all; None for what no sensor shows.
+    """
+
+    name: str
+    signals: tuple[Signal, ...]
+    shape: tuple[int, ...]
+    noise: Callable[[Any], Parameter] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        unit: str,
+        meaning: str,
+        parts: Mapping[str, Mirrored | None],
+        kind: Kind,
+        **further: Any,
+    ) -> Self:
+        """A group of one unit.
+
+        Args:
+            name: Of the group.
+            unit: Of its columns.
+            meaning: Of a column, which may name its {part}.
+            parts: Names of the columns, and what each is in the mirror.
+            kind: See `Signal`.
+            **further: Other attributes.
+        """
+        signals = tuple(
+            Signal(
+                f"{name}.{part}" if len(parts) > 1 else name,
+                unit,
+                meaning.format(part=part),
+                kind=kind,
+                mirrored=mirrored,
+            )
+            for part, mirrored in parts.items()
+        )
+        return cls(name, signals, **{"shape": (len(signals),), **further})
 
 
 @dataclass(frozen=True)
@@ -48,9 +109,18 @@ class SignalTable:
         """Column names in order."""
         return tuple(signal.name for signal in self.signals)
 
+    @classmethod
+    def of(cls, groups: Sequence[SignalGroup]) -> Self:
+        """The columns of groups, one group after the other."""
+        return cls(tuple(signal for group in groups for signal in group.signals))
+
     def extended(self, signals: Sequence[Signal]) -> "SignalTable":
         """This table with further columns behind its own."""
         return SignalTable((*self.signals, *signals))
+
+    def signals_of(self, name: str) -> tuple[Signal, ...]:
+        """The signals of a group, see `group`."""
+        return self.signals[self.group(name)]
 
     def columns(self, *names: str) -> slice | list[int]:
         """Where the named columns stand, a slice if they are neighbours."""
@@ -77,6 +147,11 @@ class SignalTable:
         low = np.array([signal.low for signal in self.signals])
         high = np.array([signal.high for signal in self.signals])
         return spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
+
+
+def renamed(signals: Sequence[Signal], group: str) -> tuple[Signal, ...]:
+    """The same quantities by another way, under the name of another group."""
+    return tuple(replace(signal, name=".".join([group, *signal.name.split(".")[1:]]), kind=None) for signal in signals)
 
 
 NO_SIGNALS = SignalTable(())

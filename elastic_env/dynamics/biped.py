@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
+from elastic_env.dynamics.ground_contact import FootSensors
 from elastic_env.dynamics.leg_chains import LegChains
 from elastic_env.dynamics.leg_kinematics import JOINTS, LegGeometry, leg_angles
 
@@ -40,6 +41,12 @@ class Biped:
     def chains_above_feet(self) -> LegChains:
         """The legs with feet that weigh nothing: what the sensors at the ankles do not carry."""
         return LegChains(self.rigid, self._legs, feet_weigh=False)
+
+    @cached_property
+    def foot_sensors(self) -> FootSensors:
+        """The force-torque sensors at its ankles."""
+        feet = [int(self.rigid.joint(leg[-1]).bodyid[0]) for leg in self._legs]
+        return FootSensors(self.rigid.body_mass[feet], self.rigid.body_ipos[feet], self.rigid.opt.gravity)
 
     @property
     def _legs(self) -> list[tuple[str, ...]]:

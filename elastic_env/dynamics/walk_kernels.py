@@ -226,13 +226,14 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
     for foot in range(2):
         for i in range(3):
             force, moment = row.wrench[foot, 0, i], row.wrench[foot, 1, i]
-            shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.force_noise_n + force
-            shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.moment_noise_nm + moment
+            shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
+            shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
     if imu_is_due:
-        shown.imu_attitude[0] = shown_angle(row.roll, bias.imu_attitude[0], noise.imu_attitude[0], quality)
-        shown.imu_attitude[1] = shown_angle(row.pitch, bias.imu_attitude[1], noise.imu_attitude[1], quality)
+        for i, angle in enumerate((row.roll, row.pitch)):
+            drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
+            shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], drawn, quality)
         for i in range(3):
-            shown.imu_rate[i] = noise.imu_rate[i] * quality.gyro_noise_rad_s + row.pelvis_rate[i]
+            shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
 
 
 @compiled
@@ -245,7 +246,7 @@ def in_whole_counts(angle: float, count_rad: float) -> float:
 def shown_angle(angle: float, drawn_bias: float, noise: float, quality: Any) -> float:
     """An angle by the IMU, see `elastic_env.runtime.sensors.attitude` [rad]."""
     constant = quality.imu_bias_rad + quality.imu_sine_error_rad * np.sin(angle)
-    return angle + drawn_bias + quality.imu_noise_rad * noise + constant
+    return angle + drawn_bias + noise + constant
 
 
 @compiled

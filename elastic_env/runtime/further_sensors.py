@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import unknown_name
-from elastic_env.core.signals import Array, BoolArray, Signal
+from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
 from elastic_env.core.state import Stateful
 from elastic_env.runtime.scenario import Scenario
 from elastic_env.runtime.sensors import NoiseStream, quantise
@@ -60,8 +60,7 @@ class Sensor:
     Attributes:
         unit, meaning: Of its columns.
         truth: What it would show without error, (num_worlds, columns).
-        axes: Names of its columns; none where it has one per joint.
-        mirrored: Signs of its axes in the mirror, left for right; a joint's column is as the joint.
+        axes: Names of its columns and what each is in the mirror; none where it has one per joint.
         noise: Standard deviation [unit].
         offset: Half-width of an offset that is drawn per episode [unit].
         is_encoder: Whether it has whole counts, and the homing error of the encoders.
@@ -70,16 +69,14 @@ class Sensor:
     unit: str
     meaning: str
     truth: Callable[[Measured], Array]
-    axes: tuple[str, ...] = ()
-    mirrored: tuple[float, ...] = ()
+    axes: Mapping[str, Mirrored] | None = None
     noise: float = 0.0
     offset: float = 0.0
     is_encoder: bool = False
 
-    def names(self, name: str, joints: Sequence[str]) -> list[str]:
-        """Names of its columns."""
-        columns = self.axes or joints
-        return [name] if len(columns) == 1 else [f"{name}.{column}" for column in columns]
+    def group(self, name: str, joints: Mapping[str, Mirrored | None]) -> SignalGroup:
+        """Its columns, of a robot with these joints and what their angles are in the mirror."""
+        return SignalGroup.of(name, self.unit, self.meaning, self.axes or joints, "measured")
 
 
 SENSORS: Mapping[str, Sensor] = {
@@ -89,7 +86,7 @@ SENSORS: Mapping[str, Sensor] = {
     ),
     "accelerometer": Sensor(
         "m/s²", "specific force at the IMU, in its frame", lambda truth: truth.specific_force,
-        axes=("x", "y", "z"), mirrored=(1.0, -1.0, 1.0), noise=1.0e-3 * np.sqrt(125.0),
+        axes={"x": "same", "y": "opposite", "z": "same"}, noise=1.0e-3 * np.sqrt(125.0),
     ),
 }  # fmt: skip
 """Sensors by the name that `sensors=[...]` gives them."""
@@ -115,7 +112,7 @@ class FurtherSensors(Stateful):
 
     Args:
         names: Of `SENSORS`.
-        joints: The robot's joints, in order.
+        joints: The robot's joints in order, and what their angles are in the mirror, None where it has none.
         scenario: Whose `sensor_noise` scales noise and offset, and which has the encoders' errors.
         counts_per_turn: Of the encoders.
         num_worlds: How many.
@@ -129,7 +126,7 @@ class FurtherSensors(Stateful):
     def __init__(
         self,
         names: Sequence[str],
-        joints: Sequence[str],
+        joints: Mapping[str, Mirrored | None],
         scenario: Scenario,
         counts_per_turn: int | None,
         num_worlds: int,
@@ -140,16 +137,12 @@ class FurtherSensors(Stateful):
         self._sensors = {name: SENSORS[name] for name in names}
         self._scenario = scenario
         self._counts = counts_per_turn if scenario.encoder_counts else None
-        columns = {name: sensor.names(name, joints) for name, sensor in self._sensors.items()}
-        self.signals = tuple(
-            Signal(column, sensor.unit, sensor.meaning)
-            for name, sensor in self._sensors.items()
-            for column in columns[name]
-        )
+        groups = [sensor.group(name, joints) for name, sensor in self._sensors.items()]
+        self.signals = SignalTable.of(groups).signals
         """Their columns of the observation, in order."""
-        kind: Any = np.dtype([(name, np.float64, (len(columns[name]),)) for name in names])
+        kind: Any = np.dtype([(group.name, np.float64, group.shape) for group in groups])
         self._noise = NoiseStream(num_worlds, kind) if names else None
-        self._offset = {name: np.zeros((num_worlds, len(columns[name]))) for name in names}
+        self._offset = {group.name: np.zeros((num_worlds, *group.shape)) for group in groups}
         self._now = self._before = np.zeros((num_worlds, len(self.signals)))
 
     def __bool__(self) -> bool:

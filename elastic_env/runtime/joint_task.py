@@ -8,13 +8,13 @@ the deflections, of the servo errors and of the offsets' rates, largest joint to
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from elastic_env.core.rows import Rows
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signal, Signals, SignalTable
+from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
 from elastic_env.core.state import Stateful
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
@@ -31,7 +31,7 @@ from elastic_env.runtime.task import Outcome
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
 
-LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link")
+LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 
 NOISE = np.dtype([("imu", np.float64)])
 """A sample of noise [1]."""
@@ -175,32 +175,28 @@ def over_joints(values: Array) -> Array:
     return np.abs(values[:, 0]) if values.shape[1] == 1 else np.sqrt(np.square(values).mean(axis=1))
 
 
-def named(name: str, joints: Sequence[str]) -> list[str]:
-    """Names of a signal that every joint has."""
-    return [name] if len(joints) == 1 else [f"{name}.{joint}" for joint in joints]
+def _names(name: str, joints: Sequence[str]) -> list[str]:
+    return [f"{name}.{joint}" for joint in joints] if len(joints) > 1 else [name]
 
 
 def action_table(joints: Sequence[str]) -> SignalTable:
     """The action: an offset for every joint."""
-    return SignalTable(
-        tuple(
-            Signal(name, "rad", "θ_cmd − q_ref", low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD)
-            for name in named("command_offset", joints)
-        )
-    )
+    offsets = SignalGroup.of("command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command").signals
+    return SignalTable(tuple(replace(signal, low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD) for signal in offsets))
 
 
-def observation_signals(joints: Sequence[str]) -> list[Signal]:
+def observation_signals(joints: Sequence[str]) -> tuple[Signal, ...]:
     """The standard set."""
-    per_joint = (
-        ("encoder_angle", "rad", "motor encoder, θ in whole counts"),
-        ("encoder_rate", "rad/s", "its change over the last control period"),
-        ("reference_angle", "rad", "q_ref at the end of the coming control period"),
-        ("reference_rate", "rad/s", "its rate"),
-        ("reference_acceleration", "rad/s²", "its acceleration"),
-        ("last_command", "rad", "θ_cmd of the last control period"),
+    groups: tuple[tuple[str, str, str, Kind], ...] = (
+        ("encoder_angle", "rad", "motor encoder, θ in whole counts", "measured"),
+        ("encoder_rate", "rad/s", "its change over the last control period", "measured"),
+        ("reference_angle", "rad", "q_ref at the end of the coming control period", "reference"),
+        ("reference_rate", "rad/s", "its rate", "reference"),
+        ("reference_acceleration", "rad/s²", "its acceleration", "reference"),
+        ("last_command", "rad", "θ_cmd of the last control period", "command"),
     )
-    return [Signal(one, unit, meaning) for name, unit, meaning in per_joint for one in named(name, joints)]
+    made = [SignalGroup.of(name, unit, meaning, dict.fromkeys(joints), kind) for name, unit, meaning, kind in groups]
+    return SignalTable.of(made).signals
 
 
 class JointTask(Stateful):
@@ -227,7 +223,7 @@ class JointTask(Stateful):
         self._plant, self._joints, self._observes_imu = plant, joints, observe_imu
         self.metrics: Sequence[Metric] = METRICS_OF_ONE if n == 1 else METRICS_OF_SEVERAL
         self._sensors = FurtherSensors(
-            config.sensors, joints, config.scenario, plant.true.encoder_counts_per_turn, num_worlds
+            config.sensors, dict.fromkeys(joints), config.scenario, plant.true.encoder_counts_per_turn, num_worlds
         )
         self.action_table = action_table(joints)
         observed = [*observation_signals(joints), *([LINK_IMU] if observe_imu else []), *self._sensors.signals]
@@ -350,7 +346,7 @@ class JointTask(Stateful):
             one: values[:, column].copy()
             for name, values in of_joints.items()
             if "imu" not in name
-            for column, one in enumerate(named(name, self._joints))
+            for column, one in enumerate(_names(name, self._joints))
         }
         error = of_joints["link_error"]
         summed = "link_error", "deflection", "servo_error", "command_rate"

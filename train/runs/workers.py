@@ -17,7 +17,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError, shown
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, shown
 
 _MOST_JOBS = 1024
 _LEAST_S = 10.0

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.model import LEG_JOINTS
+from elastic_env.robots.thormang.tables import GROUPS
 from elastic_env.runtime.robot_model import WalkerModel
 
 Records: TypeAlias = npt.NDArray[Any]
@@ -55,8 +56,8 @@ MEASURED = record_type(
 )  # fmt: skip
 """What the sensors show."""
 
-NOISE = record_type(("imu_attitude", REAL, 2), ("imu_rate", REAL, 3), ("wrench", REAL, _FEET_WRENCH))
-"""Standard normal samples of a control step [1]."""
+NOISE = record_type(*((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None))
+"""Standard normal samples of a control step [1], or their standard deviations in the units of the signals."""
 
 BIAS = record_type(("encoder", REAL, NUM_JOINTS), ("imu_attitude", REAL, 2))
 """Errors of homing and mounting, drawn per episode [rad]."""
@@ -77,10 +78,10 @@ ROW_OF_PLAN = record_type(
 
 QUALITY = record_type(
     ("count_rad", REAL),  # of the encoders, 0 for none
-    ("imu_noise_rad", REAL), ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL),
-    ("gyro_noise_rad_s", REAL), ("force_noise_n", REAL), ("moment_noise_nm", REAL),
+    ("noise", NOISE),  # standard deviations
+    ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL),
 )  # fmt: skip
-"""Quality of the sensors: standard deviations and constant errors."""
+"""Quality of the sensors: noise and constant errors."""
 
 RULES = record_type(
     ("control_period_s", REAL), ("is_delayed", np.bool_),  # whether measurements are shown a step late
@@ -106,15 +107,8 @@ CONSTANTS = record_type(
 )  # fmt: skip
 """What does not change."""
 
-OBSERVED = record_type(
-    ("encoder_angle", REAL, NUM_JOINTS), ("encoder_rate", REAL, NUM_JOINTS),
-    ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3), ("wrench", REAL, _FEET_WRENCH),
-    ("reference_angle", REAL, NUM_JOINTS), ("reference_rate", REAL, NUM_JOINTS),
-    ("reference_acceleration", REAL, NUM_JOINTS),
-    ("clock", REAL, 3), ("load_share", REAL), ("zmp_reference", REAL, 2),
-    ("last_command", REAL, NUM_JOINTS),
-)  # fmt: skip
-"""Columns of the observation, see `elastic_env.robots.thormang.task`."""
+OBSERVED = record_type(*((group.name, REAL, group.shape) for group in GROUPS))
+"""Columns of the observation, see `elastic_env.robots.thormang.tables`."""
 
 
 def one(kind: np.dtype[Any], **values: Any) -> Records:

@@ -1,24 +1,21 @@
 """What the walking task observes, commands and scores, by name; `elastic_env.robots.thormang.task` shows the table."""
 
-from elastic_env.core.signals import Signal, SignalTable
-from elastic_env.robots.thormang.model import LEG_JOINTS
+from collections.abc import Mapping
+
+import numpy as np
+
+from elastic_env.core.signals import Mirrored, Signal, SignalGroup, SignalTable
+from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES
 from elastic_env.runtime.metrics import Metric
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
 
 
-def _per_joint(name: str, unit: str, meaning: str) -> tuple[Signal, ...]:
-    return tuple(Signal(f"{name}.{joint}", unit, f"{meaning}, {joint}") for joint in LEG_JOINTS)
-
-
-def _wrench(side: str) -> tuple[Signal, ...]:
-    return tuple(
-        Signal(f"wrench.{side}_{kind}{axis}", unit, f"{what} of the {side} foot on its leg along {axis}, at the ankle")
-        for kind, unit, what in (("f", "N", "force"), ("m", "N·m", "moment"))
-        for axis in "xyz"
-    )
-
+JOINTS: Mapping[str, Mirrored] = {
+    joint: "opposite" if joint.endswith(("_yaw", "_roll")) else "same" for joint in LEG_JOINTS
+}
+"""The joints in order, and what an angle of theirs is in the mirror."""
 
 ACTION = SignalTable(
     tuple(
@@ -27,26 +24,65 @@ ACTION = SignalTable(
     )
 )
 
-OBSERVATION = SignalTable(
-    (
-        *_per_joint("encoder_angle", "rad", "motor encoder, θ in whole counts"),
-        *_per_joint("encoder_rate", "rad/s", "change of the encoder over the last control period"),
-        *(Signal(f"imu_attitude.{axis}", "rad", f"{axis} of the pelvis by its IMU") for axis in ("roll", "pitch")),
-        *(Signal(f"imu_rate.{axis}", "rad/s", f"gyroscope of the pelvis about its {axis}") for axis in "xyz"),
-        *_wrench("l"),
-        *_wrench("r"),
-        *_per_joint("reference_angle", "rad", "q_ref at the end of the coming control period"),
-        *_per_joint("reference_rate", "rad/s", "its rate"),
-        *_per_joint("reference_acceleration", "rad/s²", "its acceleration"),
-        Signal("clock.time", "s", "end of the coming control period, from the start of the walk plan"),
-        Signal("clock.swing", "1", "progress of the swing, 0 before lift-off, 1 after touch-down"),
-        Signal("clock.support", "1", "support foot of the step, 0 left, 1 right"),
-        Signal("load_share", "1", "share of the weight on the right foot"),
-        Signal("zmp_reference.x", "m", "reference of the ZMP, forward"),
-        Signal("zmp_reference.y", "m", "reference of the ZMP, to the left"),
-        *_per_joint("last_command", "rad", "θ_cmd of the last control period"),
+
+def _wrenches() -> tuple[Signal, ...]:
+    of_force: dict[str, Mirrored] = {"x": "same", "y": "opposite", "z": "same"}
+    of_moment: dict[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
+    kinds = ("f", "N", "force", of_force), ("m", "N·m", "moment", of_moment)
+    return tuple(
+        Signal(
+            f"wrench.{side}_{letter}{axis}", unit,
+            f"{what} of the {foot} foot on its leg along {axis}, in the frame of the foot, at the ankle",
+            kind="measured", mirrored=mirrored,
+        )
+        for side, foot in zip(SIDES, ("left", "right"), strict=True)
+        for letter, unit, what, axes in kinds
+        for axis, mirrored in axes.items()
+    )  # fmt: skip
+
+
+def _clock() -> tuple[Signal, ...]:
+    parts: tuple[tuple[str, str, str, Mirrored], ...] = (
+        ("time", "s", "end of the coming control period, from the start of the walk plan", "same"),
+        ("swing", "1", "progress of the swing, 0 before lift-off, 1 after touch-down", "same"),
+        ("support", "1", "support foot of the step, 0 left, 1 right", "complement"),
     )
-)
+    return tuple(
+        Signal(f"clock.{part}", unit, meaning, kind="reference", mirrored=mirrored)
+        for part, unit, meaning, mirrored in parts
+    )
+
+
+_TURNS: dict[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
+_RATES: dict[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
+_of = SignalGroup.of
+
+GROUPS = (
+    _of("encoder_angle", "rad", "motor encoder, θ in whole counts, {part}", JOINTS, "measured"),
+    _of("encoder_rate", "rad/s", "its change over the last control period, {part}", JOINTS, "measured"),
+    _of(
+        "imu_attitude", "rad", "{part} of the pelvis by its IMU", _TURNS, "measured",
+        noise=lambda scenario: scenario.pelvis_imu.noise_rad,
+    ),
+    _of(
+        "imu_rate", "rad/s", "gyroscope of the pelvis about its {part}", _RATES, "measured",
+        noise=lambda scenario: scenario.gyro_noise_rad_s,
+    ),
+    SignalGroup(
+        "wrench", _wrenches(), shape=(2, 2, 3),
+        noise=lambda scenario: np.array([[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3]),
+    ),
+    _of("reference_angle", "rad", "q_ref at the end of the coming control period, {part}", JOINTS, "reference"),
+    _of("reference_rate", "rad/s", "its rate, {part}", JOINTS, "reference"),
+    _of("reference_acceleration", "rad/s²", "its acceleration, {part}", JOINTS, "reference"),
+    SignalGroup("clock", _clock(), shape=(3,)),
+    _of("load_share", "1", "share of the weight on the right foot", {"right": "complement"}, "reference", shape=()),
+    _of("zmp_reference", "m", "reference of the ZMP along {part}", {"x": "same", "y": "opposite"}, "reference"),
+    _of("last_command", "rad", "θ_cmd of the last control period, {part}", JOINTS, "command"),
+)  # fmt: skip
+"""The observation; what a sensor shows, its noise and its mirror image are said here alone."""
+
+OBSERVATION = SignalTable.of(GROUPS)
 
 FELL = "fell"
 

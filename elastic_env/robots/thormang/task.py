@@ -94,7 +94,7 @@ from elastic_env.robots.thormang.rows import (
     WalkTruth,
     one,
 )
-from elastic_env.robots.thormang.tables import ACTION, FELL, METRICS, OBSERVATION, PHASES
+from elastic_env.robots.thormang.tables import ACTION, FELL, GROUPS, JOINTS, METRICS, OBSERVATION, PHASES
 from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
@@ -129,7 +129,7 @@ class WalkTask(Stateful):
         self.num_worlds = num_worlds
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         counts = next(iter(config.true_joints.values())).encoder_counts_per_turn
-        self._sensors = FurtherSensors(config.sensors, LEG_JOINTS, config.scenario, counts, num_worlds)
+        self._sensors = FurtherSensors(config.sensors, JOINTS, config.scenario, counts, num_worlds)
         table = self.observation_table = OBSERVATION.extended(self._sensors.signals)
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
@@ -439,12 +439,13 @@ def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
 
 def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:
     """Quality of the sensors in a scenario, one row of `QUALITY`."""
-    imu = scenario.pelvis_imu
+    imu, noise = scenario.pelvis_imu, np.zeros(1, NOISE)
+    for group in GROUPS:
+        if group.noise is not None:
+            noise[group.name] = group.noise(scenario)
     return one(
-        QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None),
-        imu_noise_rad=imu.noise_rad, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
-        gyro_noise_rad_s=scenario.gyro_noise_rad_s, force_noise_n=scenario.force_noise_n,
-        moment_noise_nm=scenario.moment_noise_nm,
+        QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None), noise=noise,
+        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
     )  # fmt: skip
 
 
