@@ -118,10 +118,14 @@ def test_importing_environment_and_baselines_loads_no_torch() -> None:
 
 
 def test_the_three_packages_and_all_their_parts_are_installed() -> None:
-    """Catches a new subpackage that the list in pyproject.toml forgets, so that only editable installs work."""
+    """Catches a subpackage or a data file that pyproject.toml forgets, so that only editable installs work."""
     import tomllib
 
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     listed = set(settings["tool"]["setuptools"]["packages"])
     existing = {".".join(file.parent.relative_to(ROOT).parts) for file in FILES if file.name == "__init__.py"}
     assert listed == existing
+    patterns = settings["tool"]["setuptools"]["package-data"]
+    packed = {file for name in PACKAGES for pattern in patterns[name] for file in (ROOT / name).glob(pattern)}
+    data = {file for name in PACKAGES for file in (ROOT / name).rglob("*") if file.is_file() and file.suffix != ".py"}
+    assert {file for file in data - packed if "__pycache__" not in file.parts} == set()

@@ -5,7 +5,7 @@ import itertools
 import json
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,9 @@ from train.evaluate.progress import learning_curves
 from train.evaluate.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
 from train.experiments.compare import CompareConfig
 from train.figures.figures import has_swept_references
-from train.report import Results, require_plotly, write_report
+from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.changes_tables import changes_table, write_statistics
-from train.report.page import changes_html
+from train.report.page import Page
 from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
@@ -255,7 +255,11 @@ def test_a_group_without_a_pair_in_one_of_its_scenarios_has_no_figures() -> None
     pooled = next(row for row in rows if row.is_group)
     assert not np.isfinite([pooled.relative.value, pooled.improvement.value, pooled.mine]).any()
     assert pooled.sentence.startswith("nothing to compare: in one of the scenarios there is no episode in which both")
-    assert "nan" not in changes_html([pooled], {"learned": "red"}, [])
+    page = Page("x", "")
+    page.section("Changes")
+    page.add("changes", {"lines": [[pooled]], "colour": {"learned": "red"}, "swept": []})
+    assert "nan" not in (html := page.html(plotly_js=""))
+    assert pooled.sentence in html
 
 
 def test_folders_that_are_no_family_are_refused() -> None:
@@ -534,11 +538,14 @@ def test_learning_curves_are_shares_of_the_base_and_gaps_where_a_scenario_failed
     np.testing.assert_array_equal(found.ratios["pelvis_error_rms_rad"], [[1.0, 0.375, np.nan]])
 
 
-def test_without_plotly_the_comparison_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("module", "require"), [("plotly.offline", require_plotly), ("jinja2", require_jinja2)])
+def test_without_its_packages_the_comparison_says_what_to_install(
+    module: str, require: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches minutes of work that end in an import error."""
-    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
-    with pytest.raises(MissingExtraError, match=r"report needs the package plotly; .*'\.\[report\]'"):
-        require_plotly()
+    monkeypatch.setitem(__import__("sys").modules, module, None)
+    with pytest.raises(MissingExtraError, match=rf"report needs the package {module[:6]}; .*'\.\[report\]'"):
+        require()
 
 
 # elastic compare with residuals.

@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from train.report.page import Page
+from train.report.parts import Chart
 from train.runs.escaping import chart_text, csv_row, markdown_table, script_json
 
 NASTY = [
@@ -82,3 +84,26 @@ def test_a_chart_shows_a_label_as_it_is(label: str) -> None:
     """Catches a label whose tags a chart would draw."""
     assert "<" not in chart_text(label)
     assert html.unescape(chart_text(label)) == label
+
+
+def page_of(text: str) -> str:
+    """A page that has a text in every place where one can stand, in thirteen elements and a chart."""
+    page = Page(text, text)
+    page.section(text, text)
+    page.add("heading", text, folded=text)
+    page.add("bullets", [text])
+    page.add("definitions", [(text, text)])
+    page.add("table", {"head": [text], "rows": [[text]], "words": 1})
+    page.add("chart", Chart({"name": text}, height=100))
+    return page.html(plotly_js="0")
+
+
+@pytest.mark.parametrize("label", NASTY)
+def test_a_page_shows_a_label_as_it_is(label: str) -> None:
+    """Catches a template that does not escape, and one that escapes what is escaped."""
+    page, plain = Scripts(), Scripts()
+    page.feed(page_of(label))
+    plain.feed(page_of("plain"))
+    assert page.tags == plain.tags
+    assert html.unescape(page_of(label)).count(f">{label}<") == 13
+    assert json.loads(page.scripts[1]) == {"name": label}

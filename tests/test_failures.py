@@ -65,6 +65,7 @@ def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[s
         (MemoryError(), "there is not enough memory", 3),
         (ModuleNotFoundError("", name="torch"), "constraints.txt '.[train]'", 2),
         (ModuleNotFoundError("", name="plotly.offline"), "constraints.txt '.[report]'", 2),
+        (ModuleNotFoundError("", name="jinja2"), "constraints.txt '.[report]'", 2),
     ],
 )
 def test_a_failure_is_a_sentence_and_a_code(error: Exception, said: str, code: int) -> None:

@@ -18,7 +18,7 @@ from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
 from train.evaluate.families import expand
 from train.figures import plots
 from train.figures.figures import draw_figures
-from train.report import Results, require_plotly, write_report
+from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.changes_tables import print_changes, write_statistics
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import run_folder
@@ -193,6 +193,7 @@ def compare(
     plots.require_matplotlib()
     if report:
         require_plotly()
+        require_jinja2()
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
     with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
+from train.evaluate.changes import by_line
 from train.evaluate.evaluate import Evaluation
 from train.figures.figures import has_swept_references
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
 from train.report.markdown import markdown
-from train.report.page import Page, changes_html, definitions, fold, table
+from train.report.page import Page
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
 
 _LONG = 40
@@ -41,8 +42,8 @@ def _page(results: Results) -> Page:
     known = results.lines.environment
     page = Page(f"Comparison: {results.name}", f"{capital(known.subject)}; made {results.metadata['created'][:10]}")
     page.section("What was compared")
-    page.add(definitions(what(results)))
-    page.bullets(in_short(results))
+    page.add("definitions", what(results))
+    page.add("bullets", in_short(results))
     if results.swept is None:
         _add_ladder(page, results)
     _add_changes(page, results)
@@ -51,82 +52,84 @@ def _page(results: Results) -> Page:
         _add_curves(page, results)
     _add_sweeps(page, results)
     if results.learning:
-        page.section("Learning curves")
-        chart = learning(results.learning, known.judged, results.lines.colour)
-        page.text(
+        page.section(
+            "Learning curves",
             "Score over that of the base (dotted) on episodes that training never sees, mean over the trained "
-            "scenarios: median over training seeds, band from the best to the worst."
+            "scenarios: median over training seeds, band from the best to the worst.",
         )
-        page.chart(chart)
+        page.add("chart", learning(results.learning, known.judged, results.lines.colour))
     page.section("Notes")
-    page.bullets(notes(results))
+    page.add("bullets", notes(results))
     return page
 
 
 def _add_ladder(page: Page, results: Results) -> None:
-    page.section("Ladder of policies")
     seeds = (
         " Diamonds are residuals: interquartile mean over training seeds with its 95 % interval."
         if results.families else ""
     )  # fmt: skip
-    page.text(f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}")
+    page.section(
+        "Ladder of policies",
+        f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}",
+    )
     references = results.lines.references
     for number, reference in enumerate(references):
         chart = ladder(results.lines, reference)
         title = results.lines.environment.title(reference)
-        page.chart(chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
+        page.add("chart", chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
 
 
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
     trained = [row for row in results.changes if row.is_family]
     others = [row for row in results.changes if not row.is_family]
-    colour, swept = results.lines.colour, results.swept_options
+    more = {"colour": results.lines.colour, "swept": results.swept_options}
     if trained:
-        page.section("Residuals against their base")
         drawn = results.swept is None
         marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
-        page.text(
+        page.section(
+            "Residuals against their base",
             "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below "
-            f"zero; red: above; grey: it includes zero, or there are too few training seeds.{marks}"
+            f"zero; red: above; grey: it includes zero, or there are too few training seeds.{marks}",
         )
         for title in dict.fromkeys(row.policy for row in trained if drawn):
             own = [row for row in trained if row.policy == title and row.is_judged]
-            page.heading(f"{title} against {own[0].base}")
-            page.chart(forest(own))
-        _add_table(page, "Table of changes", changes_html(trained, colour, swept), len(trained))
+            page.add("heading", f"{title} against {own[0].base}")
+            page.add("chart", forest(own))
+        page.add("changes", {"lines": by_line(trained), **more}, _if_long("Table of changes", trained))
     if others:
-        page.section("Baselines against one another")
-        page.text("Paired differences of means. Baselines are not trained: there are no training seeds to draw from.")
-        _add_table(page, "Table of differences", changes_html(others, colour, swept, False), len(others))
+        page.section(
+            "Baselines against one another",
+            "Paired differences of means. Baselines are not trained: there are no training seeds to draw from.",
+        )
+        page.add("changes", {"lines": by_line(others), **more}, _if_long("Table of differences", others))
 
 
-def _add_table(page: Page, title: str, html: str, rows: int) -> None:
-    page.add(html if rows <= _LONG else fold(f"{title} ({rows} rows)", html))
+def _if_long(title: str, rows: Sequence[object]) -> str | None:
+    """The title under which a table is folded away; None for a short one."""
+    return f"{title} ({len(rows)} rows)" if len(rows) > _LONG else None
 
 
 def _add_phases(page: Page, results: Results) -> None:
     for title, columns in results.lines.environment.splits:
-        page.section(title)
-        page.text(SCORES)
+        page.section(title, SCORES)
         head, rows = scores(results, columns)
-        _add_table(
-            page, f"Table ({len(rows)} rows)", table(head, rows, words=3 + len(results.swept_options)), len(rows)
-        )
+        content = {"head": head, "rows": rows, "words": 3 + len(results.swept_options)}
+        page.add("table", content, _if_long(f"Table ({len(rows)} rows)", rows))
 
 
 def _add_curves(page: Page, results: Results) -> None:
-    page.section("Curves over time")
     band = " Of residuals: median over training seeds, band from the least to the most." if results.families else ""
     shade = " Single support is shaded." if results.lines.environment.splits else ""
-    page.text(f"The first episode of every cell; a line ends where the episode does.{band}{shade}")
+    text = f"The first episode of every cell; a line ends where the episode does.{band}{shade}"
+    page.section("Curves over time", text)
     first = True
     for reference in results.lines.references:
         for scenario in results.lines.scenarios:
             chart = over_time(results.lines, reference, scenario)
             if chart is not None:
                 title = f"{results.lines.environment.title(reference)}, {scenario}"
-                page.chart(chart, folded=capital(title), is_open=first)
+                page.add("chart", chart, folded=capital(title), is_open=first)
                 first = False
 
 
@@ -147,14 +150,14 @@ def _add_sweeps(page: Page, results: Results) -> None:
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
     if not charts:
         return
-    page.section("Sweeps")
-    page.text(
+    page.section(
+        "Sweeps",
         "Means over the episodes that reached the end. A cross on top: all episodes of a policy failed there; an "
-        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.families else "")
+        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.families else ""),
     )
     for number, (title, points, label) in enumerate(charts):
         chart = sweep(lines, {t: own for t, own in points.items() if own}, label)
-        page.chart(chart, folded=capital(title), is_open=number == 0)
+        page.add("chart", chart, folded=capital(title), is_open=number == 0)
 
 
 def _by_option(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Evaluation]]:

@@ -17,7 +17,7 @@ WRONG_INPUT, SYSTEM_FAILED, DEFECT = 2, 3, 70
 
 _EXTRAS = {
     "train": ("torch", "stable_baselines3", "tensorboard", "cmaes"),
-    "report": ("matplotlib", "plotly", "imageio", "imageio_ffmpeg", "PIL"),
+    "report": ("matplotlib", "plotly", "jinja2", "imageio", "imageio_ffmpeg", "PIL"),
     "hardware": ("dynamixel_sdk", "serial", "mscl"),
 }
 _CURES = {
