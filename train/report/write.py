@@ -115,7 +115,7 @@ def _add_phases(page: Page, results: Results) -> None:
         page.section(title, SCORES)
         head, rows = scores(results, columns)
         content = {"head": head, "rows": rows, "words": 3 + len(results.swept_options)}
-        page.add("table", content, _if_long(f"Table ({len(rows)} rows)", rows))
+        page.add("table", content, _if_long("Table", rows))
 
 
 def _add_curves(page: Page, results: Results) -> None:
