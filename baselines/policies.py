@@ -1,120 +1,39 @@
-"""The baselines by name.
+"""The baselines by name; `baselines.catalogue` says how each is built."""
 
-Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to whatever a policy commands
-and shows it compensated encoder readings. The named policies are such compositions.
-"""
-
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from baselines.compensation.compensated import Compensated
-from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
-from baselines.compensation.gravity_torque import GravityMethod
-from baselines.compensation.oracle import Oracle
-from baselines.compensation.policy import Policy, Zero
+from baselines.catalogue import ASSUMED_OPTIONS, ON_JOINTS, ON_THE_WALKER, NamedPolicy, Track
+from baselines.compensation.policy import Policy
+from baselines.options import PolicyOptions
 from baselines.residual.residual import RESIDUAL, read_description, residual_policy
-from baselines.walking.controller import WalkingController, WalkingGains
-from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel, read_stiffness
-
-
-class PolicyOptions(Model):
-    """Options of the named policies, as keyword arguments of `make`."""
-
-    stiffness: Any = None
-    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of an identification;
-    None for the environment's assumed model."""
-    stiffness_scale: float = quantity("1", 1.0, gt=0, description="further factor on the K that is assumed")
-    output: OutputMethod | None = None
-    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and "none"; None for
-    what the policy's name says."""
-    gravity: GravityMethod | None = None
-    """How τ_g is computed: on the testbed "hinge", "pinocchio" or "batched", on the walker "com", "ankle" or "lumped";
-    None for the first of them."""
-    com_feedback: bool = True
-    """Walker: whether the controller feeds the center of mass back."""
-    gains: WalkingGains = WalkingGains()
-    """Walker: gains of the controller."""
-    ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")
-
-
-Builder = Callable[[Any, RobotModel, PolicyOptions], Policy]
-Compensating = type[GravityCompensator] | type[DynamicCompensator]
-
-
-def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001  one signature for all
-    return Zero(model.observation_table)
-
-
-def _around_zero(compensator: Compensating) -> Builder:
-    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-        made = compensator(model, options.output or "taylor", options.gravity)
-        return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
-
-    return build
-
-
-def _controller(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)  # type: ignore[arg-type]
-
-
-def _around_controller(compensator: Compensating, output: OutputMethod) -> Builder:
-    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-        made = compensator(model, options.output or output, options.gravity)
-        return Compensated(_controller(env, model, options), made, ramp_s=options.ramp_s)
-
-    return build
-
-
-def _open(build: Builder) -> Builder:
-    return lambda env, model, options: build(env, model, options.replace(com_feedback=False))
-
-
-def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-    if not hasattr(env.unwrapped, "truth"):
-        raise ConfigurationError(
-            "the oracle reads the truth, by a method truth() of the environment, which "
-            f"{type(env.unwrapped).__name__} does not have"
-        )
-    if isinstance(model, WalkerModel):
-        controller = _controller(env, env.unwrapped.truth().model, options)
-        return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)
-    return Oracle(env, _zero(env, model, options), options.ramp_s)
-
-
-_ASSUMED = ("stiffness", "stiffness_scale")
-_COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
-_CONTROLLER = ("gains", "com_feedback")
-
-_ON_THE_TESTBED: dict[str, tuple[Builder, tuple[str, ...]]] = {
-    "zero": (_zero, ()),
-    "uncompensated": (_zero, ()),
-    "input": (_around_zero(GravityCompensator), _COMPENSATOR),
-    "dynamic": (_around_zero(DynamicCompensator), _COMPENSATOR),
-    "oracle": (_oracle, ("ramp_s",)),
-}
-"""How each is built, and its options. On the testbed `uncompensated` has no controller to add and equals `zero`."""
-
-_ON_THE_WALKER: dict[str, tuple[Builder, tuple[str, ...]]] = {
-    "zero": (_zero, ()),
-    "uncompensated_open": (_open(_controller), (*_ASSUMED, "gains", "ramp_s")),
-    "uncompensated": (_controller, (*_ASSUMED, *_CONTROLLER, "ramp_s")),
-    "input_open": (_open(_around_controller(GravityCompensator, "none")), (*_COMPENSATOR, "gains")),
-    "input": (_around_controller(GravityCompensator, "none"), (*_COMPENSATOR, *_CONTROLLER)),
-    "input_output": (_around_controller(GravityCompensator, "taylor"), (*_COMPENSATOR, *_CONTROLLER)),
-    "input_wrench": (_around_controller(GravityCompensator, "wrench"), (*_COMPENSATOR, *_CONTROLLER)),
-    "dynamic": (_around_controller(DynamicCompensator, "wrench"), (*_COMPENSATOR, *_CONTROLLER)),
-    "oracle": (_oracle, (*_CONTROLLER, "ramp_s")),
-}
-"""The same. The controller alone assumes K too, for the ankles' offsets and the friction."""
 
 
 def policy_names() -> list[str]:
     """Names that `make` accepts."""
-    return list(_ON_THE_WALKER | _ON_THE_TESTBED)
+    return list({**ON_THE_WALKER, **ON_JOINTS})
+
+
+def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
+    """What is known of a policy by its name, on a walker or on another robot; None for one that is no baseline."""
+    return (ON_THE_WALKER if is_walker else ON_JOINTS).get(name)
+
+
+def track(name: str, is_walker: bool = True) -> Track:
+    """What a policy needs, by its name; one of a user's own is taken to read the standard sensors."""
+    if name.startswith(RESIDUAL):
+        return Track.TRAINING
+    known = named_policy(name, is_walker)
+    return Track.STANDARD if known is None else known.track
+
+
+def sensors_needed(name: str) -> tuple[str, ...]:
+    """Sensors beyond the standard set that a policy reads, for `gymnasium.make(..., sensors=[...])`."""
+    known = named_policy(name, is_walker=True) or named_policy(name, is_walker=False)
+    return () if known is None else known.sensors
 
 
 def make(name: str, env: Any, /, **options: Any) -> Policy:
@@ -128,6 +47,11 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `input_output` | - | also Eq. 12: the controller sees the estimated links |
     | `input_wrench` | - | the estimate takes the measured foot wrenches instead of the planned load share |
     | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
+    | `adaptive` | - | `input_output` with the stiffness of each leg adapted online |
+    | `posture` | - | `input_output` with the pelvis' attitude fed back to the hips |
+    | `adaptive_posture` | - | both: the strongest with the standard sensors |
+    | `torque_sensor` | - | deflections by joint torque sensors, K⁻¹ τ_J |
+    | `hip_sensor`, `link_encoder` | - | deflections by link encoders, at the hips or at all joints |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
     | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
     | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |
@@ -153,12 +77,13 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
         )
     given = {option: value for option, value in options.items() if value is not None}
     chosen = PolicyOptions(**given)
-    known = _ON_THE_WALKER if isinstance(env.unwrapped.assumed_model, WalkerModel) else _ON_THE_TESTBED
-    if name not in known:
-        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, [*known, f"{RESIDUAL}PATH"])
-    build, usable = known[name]
-    _require_effect(name, env, given, usable)
-    return build(env, _assumed(env, chosen), chosen)
+    is_walker = isinstance(env.unwrapped.assumed_model, WalkerModel)
+    known = named_policy(name, is_walker)
+    if known is None:
+        names = ON_THE_WALKER if is_walker else ON_JOINTS
+        raise unknown_name(f"policy of the {env.unwrapped.task.name}", name, [*names, f"{RESIDUAL}PATH"])
+    _require_effect(name, env, given, known.options)
+    return known.build(env, _assumed(env, chosen), chosen)
 
 
 def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
@@ -171,12 +96,12 @@ def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     return residual_policy(folder, base, env.unwrapped.assumed_model)
 
 
-def _require_effect(name: str, env: Any, given: Iterable[str], usable: Sequence[str]) -> None:
+def _require_effect(name: str, env: Any, given: Iterable[str], usable: tuple[str, ...]) -> None:
     for option in given:
         if option not in usable:
             takes = f"its options are: {', '.join(usable)}" if usable else "it has no options"
             # of those with options the oracle alone assumes no stiffness
-            why = " but knows the true one" if option in _ASSUMED and usable else ""
+            why = " but knows the true one" if option in ASSUMED_OPTIONS and usable else ""
             task = env.unwrapped.task.name
             raise ConfigurationError(f"the policy {name!r} of the {task} does not use {option}{why}; {takes}")
 

@@ -99,7 +99,7 @@ class Compensated:
         """The links' angles by the encoders."""
         theta = self._view.theta(rows)
         q = compensator.link_angle(theta, memory)
-        return q if correction is None else q - correction * (theta - q)
+        return q if correction is None else q - compensator.modelled * correction * (theta - q)
 
     def _seen(self, compensator: Compensator, rows: Array, links: Array) -> Array:
         """The observations with the links' angles and rates where they have the encoders'."""

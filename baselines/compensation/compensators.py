@@ -82,6 +82,11 @@ class Compensator(Protocol):
     model: RobotModel
     memory_width: int
 
+    @property
+    def modelled(self) -> float | Array:
+        """1 where its link angles follow from the model, 0 where sensors show them; a number, or (n,) [1]."""
+        ...
+
     def at(self, rows: Array) -> "Compensator":
         """The compensator for the loads at the control steps of observations, (num_worlds, m)."""
         ...
@@ -121,6 +126,7 @@ class GravityCompensator:
     """
 
     memory_width = 0
+    modelled: float | Array = 1.0
 
     def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
         if output not in get_args(OutputMethod):
@@ -182,6 +188,7 @@ class DynamicCompensator:
         friction: Whether the model's Coulomb friction is part of the joint torque.
     """
 
+    modelled: float | Array = 1.0
     presliding_rad = 1e-3
     """Displacement over which the friction turns round (Dahl's model) [rad]."""
 

@@ -43,6 +43,10 @@ class WalkingGains(Model):
     velocity_filter_s: float = quantity("s", 0.05, gt=0, description="time constant of the COM velocity")
     zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
     friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0, description="joint rate at which friction acts in full")
+    weighs: bool = False
+    """Whether the force difference is a share of the mean load of the feet, else of the assumed weight: then a load on
+    the robot shortens the leg that carries it."""
+    weighing_s: float = quantity("s", 1.0, gt=0, description="time constant of that mean")
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,7 @@ class WalkingController:
         self._ramp_steps = max(round(ramp_s / self._dt), 1)
         stiffness = model.stiffness.reshape(2, 6)
         self._ankle_stiffness = stiffness[:, 4:]
+        self._weight_of_feet = self._biped.weight - self._biped.chains_above_feet.mass * self._biped.gravity
         self._friction_deflection = model.coulomb_friction / model.stiffness
 
     def predict(
@@ -115,17 +120,20 @@ class WalkingController:
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        steps, z, last, velocity, shift = memory[:, :1], memory[:, 1:2], memory[:, 2:6], memory[:, 6:8], memory[:, 8:]
+        steps, z, last, velocity, shift, weight = np.split(memory, [1, 2, 6, 8, 10], axis=1)
         steps = steps + 1.0
         share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)
         row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
-        z = self._leg_difference(rows, row, z)
+        if self._gains.weighs:
+            load = self._vertical_forces(rows).sum(axis=1, keepdims=True) + self._weight_of_feet
+            weight = weight + _share(self._dt, self._gains.weighing_s) * (load - weight)
+        z = self._leg_difference(rows, row, z, weight)
         coms = frame.com_from_soles[..., :2]
         if self._com_feedback:
             velocity, shift = self._zmp_shift(rows, row, coms, last.reshape(coms.shape), velocity, shift)
         feedback = share * (self._leg_offsets(rows, z) + self._ankle_offsets(rows, shift))
         action = feedback + self._friction_offsets(rows)
-        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift])
+        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, weight])
         action = action.astype(np.float32)
         return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
 
@@ -137,12 +145,11 @@ class WalkingController:
     def _begin(self, frame: LocalFrame) -> Array:
         coms = frame.com_from_soles[..., :2].reshape(len(frame.com), 4)
         zero = np.zeros((len(coms), 1))
-        return np.hstack([zero, zero, coms, zero, zero, zero, zero])
+        return np.hstack([zero, zero, coms, zero, zero, zero, zero, zero + self._biped.weight])
 
-    def _leg_difference(self, rows: Array, row: IntArray, z: Array) -> Array:
+    def _leg_difference(self, rows: Array, row: IntArray, z: Array, weight: Array) -> Array:
         """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
         gains = self._gains
-        weight = self._biped.weight
         vertical = self._vertical_forces(rows)
         desired = (1.0 - 2.0 * self._plan.share[row, None]) * weight
         missing = desired - (vertical[:, [LEFT]] - vertical[:, [RIGHT]])

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, field_validator
 
+from baselines.policies import sensors_needed
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.errors import shown
 from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
@@ -113,9 +114,14 @@ class Condition(Model):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the environment; what the policy says goes before, and what the reference says before that."""
+        """Arguments of the environment; what the policy says goes before, and what the reference says before that.
+
+        The environment also has the sensors that a baseline reads.
+        """
         motion = self.environment.arguments(self.reference)
-        return {"scenario": self.scenario, **self.env_options, **self.policy.env_options, **motion}
+        found = {"scenario": self.scenario, **self.env_options, **self.policy.env_options, **motion}
+        needed = sensors_needed(self.policy.name)
+        return {**found, "sensors": [*dict.fromkeys([*found.get("sensors", ()), *needed])]} if needed else found
 
     @property
     def policy_options(self) -> dict[str, Any]:

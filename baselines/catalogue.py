@@ -1,0 +1,168 @@
+"""The named policies: how each is built, which options it has, and what it needs beyond the standard sensors.
+
+Compensation is a wrapper: `Compensated(policy, compensator)` adds the input compensation to the command of a policy and
+shows it compensated encoder readings. The named policies are such compositions.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from baselines.adaptation.online_stiffness import JointEstimator, LegEstimator, OnlineStiffness
+from baselines.compensation.compensated import Compensated
+from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
+from baselines.compensation.measured import LINK_ENCODER, TORQUE_SENSOR, DeflectionSensors, MeasuredCompensator
+from baselines.compensation.oracle import Oracle
+from baselines.compensation.policy import Policy, Zero
+from baselines.options import PolicyOptions
+from baselines.walking.controller import WalkingController
+from baselines.walking.posture import PostureFeedback
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+
+Builder = Callable[[Any, Any, PolicyOptions], Any]
+"""Builds a policy for an environment, an assumed model and options."""
+Compensating = type[GravityCompensator] | type[DynamicCompensator]
+
+
+class Track(StrEnum):
+    """What a policy needs: a track of the leaderboard."""
+
+    STANDARD = "encoders, foot sensors and IMU"
+    TORQUE_SENSORS = "joint torque sensors"
+    LINK_ENCODERS = "link encoders"
+    WALKS = "walks on this robot"
+    TRAINING = "training in simulation"
+    TRUTH = "ground truth"
+
+
+@dataclass(frozen=True)
+class NamedPolicy:
+    """A policy that `baselines.make` knows by name.
+
+    Attributes:
+        build: Builds it.
+        options: Names of the `PolicyOptions` that have an effect on it.
+        track: What it needs.
+        sensors: Sensors that it reads beyond the standard set, as `gymnasium.make(..., sensors=[...])` has them.
+    """
+
+    build: Builder
+    options: tuple[str, ...] = ()
+    track: Track = Track.STANDARD
+    sensors: tuple[str, ...] = field(default=())
+
+
+def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noqa: ARG001  one signature for all
+    return Zero(model.observation_table)
+
+
+def _around_zero(compensator: Compensating) -> Builder:
+    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+        made = compensator(model, options.output or "taylor", options.gravity)
+        return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
+
+    return build
+
+
+def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
+    return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
+
+
+def _around_controller(compensator: Compensating, output: OutputMethod) -> Builder:
+    def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
+        made = compensator(model, options.output or output, options.gravity)
+        return Compensated(_controller(env, model, options), made, ramp_s=options.ramp_s)
+
+    return build
+
+
+def _open(build: Builder) -> Builder:
+    return lambda env, model, options: build(env, model, options.replace(com_feedback=False))
+
+
+def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    if not hasattr(env.unwrapped, "truth"):
+        raise ConfigurationError(
+            "the oracle reads the truth, by a method truth() of the environment, which "
+            f"{type(env.unwrapped).__name__} does not have"
+        )
+    if isinstance(model, WalkerModel):
+        controller = _controller(env, env.unwrapped.truth().model, options)
+        return Oracle(env, controller, options.ramp_s, friction=False, integral_gain=0.0)
+    return Oracle(env, _zero(env, model, options), options.ramp_s)
+
+
+def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    """The compensated policy that a feedback is built on."""
+    if options.base not in COMPENSATED:
+        raise unknown_name("base of a feedback", options.base, COMPENSATED)
+    return COMPENSATED[options.base](env, model, options)
+
+
+def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+    estimator = LegEstimator(model, options.adaptation)
+    return OnlineStiffness(_base(env, model, options), model, estimator, options.adaptation)
+
+
+def _with_posture(build: Builder) -> Builder:
+    def build_with_posture(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        return PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
+
+    return build_with_posture
+
+
+def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
+    """The deflections of some joints by sensors."""
+
+    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+        sensors = DeflectionSensors(model, sensor, joints)
+        is_walker = isinstance(model, WalkerModel)
+        inner = _controller(env, model, options) if is_walker else _zero(env, model, options)
+        base = Compensated(inner, MeasuredCompensator(model, sensors), ramp_s=options.ramp_s)
+        return OnlineStiffness(base, model, JointEstimator(model, sensors), options.adaptation)
+
+    return build
+
+
+COMPENSATED: Mapping[str, Builder] = {
+    "input": _around_controller(GravityCompensator, "none"),
+    "input_output": _around_controller(GravityCompensator, "taylor"),
+    "input_wrench": _around_controller(GravityCompensator, "wrench"),
+    "dynamic": _around_controller(DynamicCompensator, "wrench"),
+}
+"""Compensated policies of a walker, which a feedback can build on."""
+
+_ASSUMED = ("stiffness", "stiffness_scale")
+ASSUMED_OPTIONS = _ASSUMED
+"""Options that say what a policy assumes of the joints."""
+_COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
+_CONTROLLER = ("gains", "com_feedback")
+_COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
+_MEASURED = (*_ASSUMED, *_CONTROLLER, "adaptation", "ramp_s")
+
+ON_JOINTS: Mapping[str, NamedPolicy] = {
+    "zero": NamedPolicy(_zero),
+    "uncompensated": NamedPolicy(_zero),
+    "input": NamedPolicy(_around_zero(GravityCompensator), _COMPENSATOR),
+    "dynamic": NamedPolicy(_around_zero(DynamicCompensator), _COMPENSATOR),
+    "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
+}
+"""Policies of robots on a fixed base. There `uncompensated` has no controller to add and equals `zero`."""
+
+ON_THE_WALKER: Mapping[str, NamedPolicy] = {
+    "zero": NamedPolicy(_zero),
+    "uncompensated_open": NamedPolicy(_open(_controller), (*_ASSUMED, "gains", "ramp_s")),
+    "uncompensated": NamedPolicy(_controller, (*_ASSUMED, *_CONTROLLER, "ramp_s")),
+    "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
+    **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
+    "adaptive": NamedPolicy(_adaptive, (*_COMPENSATED, "base", "adaptation")),
+    "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", "posture")),
+    "adaptive_posture": NamedPolicy(_with_posture(_adaptive), (*_COMPENSATED, "base", "adaptation", "posture")),
+    "torque_sensor": NamedPolicy(_measured(TORQUE_SENSOR), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
+    "hip_sensor": NamedPolicy(_measured(LINK_ENCODER, ("hip",)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "link_encoder": NamedPolicy(_measured(LINK_ENCODER), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
+}
+"""Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""

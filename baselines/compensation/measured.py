@@ -1,0 +1,98 @@
+r"""Links that sensors show, in the place of an output compensator.
+
+| sensor | deflection | source |
+|---|---|---|
+| joint torque sensors | :math:`\delta = K^{-1} \tau_J` with the assumed K, whatever the load | [7], [12] of the paper |
+| link encoders | :math:`\delta = \theta - q`, whatever K and load | [10] of the paper, at the hips alone |
+
+A policy sees θ − δ at once. The command must not lead by δ at once: the command changes the deflection that it answers
+to, by as much as itself where legs that stand form a closed chain, and the robot falls. It leads by the model's
+deflection instead, which `baselines.adaptation` corrects slowly by what is measured.
+"""
+
+import copy
+
+import numpy as np
+
+from baselines.compensation.compensators import GravityCompensator, Motion
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.runtime.robot_model import RobotModel
+
+TORQUE_SENSOR, LINK_ENCODER = "joint_torque", "link_encoder"
+
+
+class DeflectionSensors:
+    """Deflections of joints by their sensors, see the module.
+
+    Args:
+        model: Assumed robot, whose observation has the sensor.
+        sensor: "joint_torque" or "link_encoder".
+        joints: Which joints have it, by a part of their names.
+
+    Attributes:
+        has: Which joints have it, (n,).
+
+    Raises:
+        ConfigurationError: The observation does not have the sensor.
+    """
+
+    def __init__(self, model: RobotModel, sensor: str, joints: tuple[str, ...] = ("",)) -> None:
+        table = model.observation_table
+        if sensor not in {name.split(".")[0] for name in table.names}:
+            raise ConfigurationError(
+                f"this policy reads {sensor}, which the environment does not have; make it with sensors=[{sensor!r}]"
+            )
+        self._stiffness, self._is_torque = model.stiffness, sensor == TORQUE_SENSOR
+        self._columns, self._encoder = table.group(sensor), table.group("encoder_angle")
+        self.has: BoolArray = np.array([any(part in name for part in joints) for name in model.joint_names])
+
+    def deflection(self, rows: Array) -> Array:
+        """δ = θ − q of observations, (num_worlds, n) [rad]; 0 where a joint has no sensor."""
+        shown = rows[:, self._columns]
+        return self.has * (shown / self._stiffness if self._is_torque else rows[:, self._encoder] - shown)
+
+
+class MeasuredCompensator:
+    """Eq. 9 on the command, and links by sensors where there are any, else by Eq. 12; a `Compensator`.
+
+    Args:
+        model: Assumed robot.
+        sensors: Of its joints.
+    """
+
+    memory_width = 0
+
+    def __init__(self, model: RobotModel, sensors: DeflectionSensors) -> None:
+        self.model, self._sensors, self._base = model, sensors, GravityCompensator(model)
+        self.modelled = 1.0 - sensors.has
+        self._deflection: Array = np.zeros(len(model.joint_names))
+
+    def at(self, rows: Array) -> "MeasuredCompensator":
+        """See `Compensator`."""
+        bound = copy.copy(self)
+        bound._base, bound._deflection = self._base.at(rows), self._sensors.deflection(rows)
+        return bound
+
+    def begin(self, motion: Motion) -> Array:
+        """See `Compensator`."""
+        return self._base.begin(motion)
+
+    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
+        """See `Compensator`."""
+        return self._base.offset(motion, memory)
+
+    def deflection(self, offset: Array, memory: Array) -> Array:
+        """See `Compensator`."""
+        return self._base.deflection(offset, memory)
+
+    def link_angle(self, theta: Array, memory: Array) -> Array:
+        """See `Compensator`."""
+        measured = theta - self._deflection
+        if self._sensors.has.all():
+            return measured
+        return np.where(self._sensors.has, measured, self._base.link_angle(theta, memory))
+
+    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
+        """See `Compensator`: that of the model."""
+        return self._base.link_rate(theta, theta_dot)

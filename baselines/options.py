@@ -1,0 +1,37 @@
+"""Options of the named policies."""
+
+from typing import Any
+
+from baselines.adaptation.online_stiffness import AdaptationGains
+from baselines.compensation.compensators import OutputMethod
+from baselines.compensation.gravity_torque import GravityMethod
+from baselines.walking.controller import WalkingGains
+from baselines.walking.posture import PostureGains
+from elastic_env.core.config import Model, quantity
+from elastic_env.motion.trajectory import STAND_S
+
+
+class PolicyOptions(Model):
+    """Options of the named policies, as keyword arguments of `baselines.make`."""
+
+    stiffness: Any = None
+    """K that the compensator assumes: a number, a list of one per joint [N·m/rad], or the path of an identification;
+    None for the environment's assumed model."""
+    stiffness_scale: float = quantity("1", 1.0, gt=0, description="further factor on the K that is assumed")
+    output: OutputMethod | None = None
+    """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and "none"; None for
+    what the policy's name says."""
+    gravity: GravityMethod | None = None
+    """How τ_g is computed: on the testbed "hinge", "pinocchio" or "batched", on the walker "com", "ankle" or "lumped";
+    None for the first of them."""
+    com_feedback: bool = True
+    """Walker: whether the controller feeds the center of mass back."""
+    gains: WalkingGains = WalkingGains()
+    """Walker: gains of the controller."""
+    base: str = "input_output"
+    """Walker: the compensated policy that `adaptive`, `posture` and `adaptive_posture` build on."""
+    adaptation: AdaptationGains = AdaptationGains()
+    """Walker: how fast the stiffness is adapted."""
+    posture: PostureGains = PostureGains()
+    """Walker: gains of the posture feedback."""
+    ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")

@@ -1,0 +1,109 @@
+r"""Posture feedback: the hips turn the pelvis back to level, by its IMU.
+
+The same offset on both hip rolls, and on both hip pitches, turns the pelvis against legs that stand:
+
+.. math:: u = k_p \hat\varphi + k_i \int \hat\varphi \, dt + k_d \hat\omega
+
+φ is the attitude of the IMU behind a first-order filter, ω its rate. The integral leaks, as it winds up against homing
+errors and the integrator of the foot force control else. Walking robots do this widely, also the published controller
+of this one [Kajita2010, section V].
+
+[Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from baselines.compensation.policy import Action, ObservationView, taken_up
+from baselines.compensation.startup import Ramp
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from elastic_env.motion.trajectory import STAND_S
+from elastic_env.runtime.robot_model import WalkerModel
+
+_HIP_ROLL, _HIP_PITCH = 1, 2  # of six joints of a leg
+
+
+class PostureGains(Model):
+    """Gains of the posture feedback."""
+
+    proportional: float = quantity("1", 2.0, ge=0, description="hip angle per tilt")
+    integral: float = quantity("1/s", 4.0, ge=0, description="hip angle per tilt and time")
+    derivative: float = quantity("s", 0.1, ge=0, description="hip angle per rate of the tilt")
+    leak_s: float = quantity("s", 1.0, gt=0, description="time constant with which the integral leaks")
+    filter_s: float = quantity("s", 0.02, gt=0, description="time constant of the attitude's filter")
+    limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
+
+
+class PostureFeedback:
+    """Any policy of a walker with its posture held by the hips, see the module.
+
+    Memory per world: steps, filtered roll and pitch, their integrals.
+
+    Args:
+        policy: What commands the robot.
+        model: Assumed walker.
+        gains: Gains.
+        ramp_s: Time in which the feedback grows from zero [s].
+    """
+
+    def __init__(
+        self, policy: Any, model: WalkerModel, gains: PostureGains | None = None, ramp_s: float = STAND_S
+    ) -> None:
+        self._policy, self._gains = policy, gains or PostureGains()
+        table, self._dt = model.observation_table, model.control_period_s
+        self._view = ObservationView(table, self._dt)
+        self._attitude, self._rate = table.group("imu_attitude"), table.columns("imu_rate.x", "imu_rate.y")
+        self._filter = 1.0 - float(np.exp(-self._dt / self._gains.filter_s))
+        self._ramp = Ramp(model, ramp_s)
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Action and new state."""
+        rows, memory, inner = self._taken_up(observation, state, episode_start)
+        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
+        return self._with_feedback(action, rows, memory, inner)
+
+    def predict_corrected(
+        self,
+        observation: Array,
+        correction: Array | None,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Action, Any]:
+        """`predict` with another model of the joints in the policy, see `Compensated.predict_corrected`."""
+        rows, memory, inner = self._taken_up(observation, state, episode_start)
+        action, inner = self._policy.predict_corrected(observation, correction, inner, episode_start, deterministic)
+        return self._with_feedback(action, rows, memory, inner)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angles that the policy saw, (..., 12) [rad]."""
+        return self._policy.link_estimate(observation, state[1])
+
+    def _taken_up(self, observation: Array, state: Any, episode_start: Any) -> tuple[Array, Array, Any]:
+        rows = self._view.rows(observation)
+        begun = np.zeros((len(rows), 5))
+        memory, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
+        return rows, memory, inner
+
+    def _with_feedback(self, action: Action, rows: Array, memory: Array, inner: Any) -> tuple[Action, Any]:
+        gains = self._gains
+        steps, tilt, integral = memory[:, :1] + 1.0, memory[:, 1:3], memory[:, 3:5]
+        tilt = tilt + self._filter * (rows[:, self._attitude] - tilt)
+        integral = integral + self._dt * (tilt - integral / gains.leak_s)
+        most = gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
+        integral = np.clip(integral, -most, most)
+        turn = gains.proportional * tilt + gains.integral * integral + gains.derivative * rows[:, self._rate]
+        turn = self._ramp.share(steps) * np.clip(turn, -gains.limit_rad, gains.limit_rad)
+        total = np.asarray(action, dtype=np.float64) + self._offsets(turn).reshape(np.shape(action))
+        return total.astype(np.float32), (np.hstack([steps, tilt, integral]), inner)
+
+    @staticmethod
+    def _offsets(turn: Array) -> Array:
+        """Offsets of the joints, (num_worlds, 12) [rad], that turn the pelvis by −roll and −pitch, (num_worlds, 2)."""
+        offsets = np.zeros((len(turn), 2, 6))
+        offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = turn[:, [0]], turn[:, [1]]
+        return offsets.reshape(len(turn), 12)
