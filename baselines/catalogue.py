@@ -9,14 +9,15 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from baselines.adaptation.online_stiffness import JointEstimator, LegEstimator, OnlineStiffness
+from baselines.adaptation.estimators import EncoderEstimator, LegEstimator
+from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
 from baselines.compensation.measured import LINK_ENCODER, TORQUE_SENSOR, DeflectionSensors, MeasuredCompensator
 from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
-from baselines.walking.controller import WalkingController
+from baselines.walking.controller import WalkingController, WalkingGains
 from baselines.walking.posture import PostureFeedback
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
@@ -67,7 +68,7 @@ def _around_zero(compensator: Compensating) -> Builder:
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
-    return WalkingController(model, options.com_feedback, options.gains, options.ramp_s)
+    return WalkingController(model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s)
 
 
 def _around_controller(compensator: Compensating, output: OutputMethod) -> Builder:
@@ -101,9 +102,17 @@ def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     return COMPENSATED[options.base](env, model, options)
 
 
+def _weighing(build: Builder) -> Builder:
+    """With a controller that measures the robot's weight, unless its gains are given."""
+
+    def build_weighing(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        return build(env, model, options if options.gains else options.replace(gains=_WEIGHING))
+
+    return build_weighing
+
+
 def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-    estimator = LegEstimator(model, options.adaptation)
-    return OnlineStiffness(_base(env, model, options), model, estimator, options.adaptation)
+    return OnlineStiffness(_base(env, model, options), model, LegEstimator(model), options.adaptation)
 
 
 def _with_posture(build: Builder) -> Builder:
@@ -114,17 +123,20 @@ def _with_posture(build: Builder) -> Builder:
 
 
 def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
-    """The deflections of some joints by sensors."""
+    """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by them."""
 
-    def build(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+    def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
         sensors = DeflectionSensors(model, sensor, joints)
-        is_walker = isinstance(model, WalkerModel)
-        inner = _controller(env, model, options) if is_walker else _zero(env, model, options)
-        base = Compensated(inner, MeasuredCompensator(model, sensors), ramp_s=options.ramp_s)
-        return OnlineStiffness(base, model, JointEstimator(model, sensors), options.adaptation)
+        modelled = DynamicCompensator(model, options.output or "wrench", options.gravity)
+        controller = _controller(env, model, options)
+        policy = Compensated(controller, MeasuredCompensator(modelled, sensors), options.ramp_s, corrects_policy=True)
+        estimator = LegEstimator(model, sensors) if sensor == TORQUE_SENSOR else EncoderEstimator(model, sensors)
+        return OnlineStiffness(policy, model, estimator, options.adaptation)
 
     return build
 
+
+_WEIGHING = WalkingGains(weight_filter_s=1.0)
 
 COMPENSATED: Mapping[str, Builder] = {
     "input": _around_controller(GravityCompensator, "none"),
@@ -140,7 +152,7 @@ ASSUMED_OPTIONS = _ASSUMED
 _COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
 _CONTROLLER = ("gains", "com_feedback")
 _COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
-_MEASURED = (*_ASSUMED, *_CONTROLLER, "adaptation", "ramp_s")
+_MEASURED = (*_COMPENSATED, "adaptation")
 
 ON_JOINTS: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
@@ -157,12 +169,18 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "uncompensated": NamedPolicy(_controller, (*_ASSUMED, *_CONTROLLER, "ramp_s")),
     "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
-    "adaptive": NamedPolicy(_adaptive, (*_COMPENSATED, "base", "adaptation")),
+    "adaptive": NamedPolicy(_weighing(_adaptive), (*_COMPENSATED, "base", "adaptation")),
     "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", "posture")),
-    "adaptive_posture": NamedPolicy(_with_posture(_adaptive), (*_COMPENSATED, "base", "adaptation", "posture")),
-    "torque_sensor": NamedPolicy(_measured(TORQUE_SENSOR), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
-    "hip_sensor": NamedPolicy(_measured(LINK_ENCODER, ("hip",)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
-    "link_encoder": NamedPolicy(_measured(LINK_ENCODER), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "adaptive_posture": NamedPolicy(
+        _weighing(_with_posture(_adaptive)), (*_COMPENSATED, "base", "adaptation", "posture")
+    ),
+    "torque_sensor": NamedPolicy(
+        _weighing(_measured(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
+    ),
+    "hip_sensor": NamedPolicy(
+        _weighing(_measured(LINK_ENCODER, ("hip",))), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
+    ),
+    "link_encoder": NamedPolicy(_weighing(_measured(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
 """Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""

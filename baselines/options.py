@@ -26,8 +26,8 @@ class PolicyOptions(Model):
     None for the first of them."""
     com_feedback: bool = True
     """Walker: whether the controller feeds the center of mass back."""
-    gains: WalkingGains = WalkingGains()
-    """Walker: gains of the controller."""
+    gains: WalkingGains | None = None
+    """Walker: gains of the controller; None for what the policy's name says."""
     base: str = "input_output"
     """Walker: the compensated policy that `adaptive`, `posture` and `adaptive_posture` build on."""
     adaptation: AdaptationGains = AdaptationGains()

@@ -10,10 +10,12 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
+from baselines.catalogue import ON_THE_WALKER
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Zero
+from baselines.policies import sensors_needed
 from baselines.walking.controller import WalkingController, WalkingGains
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -31,22 +33,23 @@ NAMES = (
     "oracle",
 )
 COMPENSATED = NAMES[3:]
+EVERY = tuple(ON_THE_WALKER)
 PERIOD_S = 0.004
 AT_ONCE = {"ramp_s": PERIOD_S}
 """Options with which everything is there from the first step."""
 SHORT = [0.3, 0.5, 0.3]
 
 
-def scalar(scenario: str = "nominal") -> Any:
-    """An environment of one short step."""
-    return gymnasium.make(ID, step_period=SHORT, num_steps=1, scenario=scenario)
+def scalar(scenario: str = "nominal", name: str = "zero") -> Any:
+    """An environment of one short step, with the sensors that a policy needs."""
+    return gymnasium.make(ID, step_period=SHORT, num_steps=1, scenario=scenario, sensors=sensors_needed(name))
 
 
-def vector() -> Any:
+def vector(name: str = "zero") -> Any:
     """Two of them."""
     return gymnasium.make_vec(
         ID, num_envs=2, vectorization_mode="vector_entry_point", num_threads=1,
-        step_period=SHORT, num_steps=1, scenario="nominal",
+        step_period=SHORT, num_steps=1, scenario="nominal", sensors=sensors_needed(name),
     )  # fmt: skip
 
 
@@ -77,17 +80,20 @@ def replayed(policy: Any, observations: Array) -> Array:
 
 
 @cache
-def recording() -> Array:
-    """Every eighth observation of the uncompensated walker, which stands for a second and then makes most of a step."""
-    env = scalar()
+def recording(name: str = "zero") -> Array:
+    """Every eighth observation of the uncompensated walker, which stands for a second and then makes most of a step.
+
+    It has the sensors that a policy needs.
+    """
+    env = scalar(name=name)
     observations, _ = run(baselines.make("uncompensated", env), env, 400)
     return observations[::8]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_vector_actions_are_the_scalar_ones_row_by_row(name: str) -> None:
     """Catches memory that leaks between worlds, and formulas or truths that depend on the size of the batch."""
-    worlds, world = vector(), scalar()
+    worlds, world = vector(name), scalar(name=name)
     _, together = run(baselines.make(name, worlds), worlds, 125, seed=21)
     assert together.dtype == np.float32
     for number in range(2):
@@ -96,10 +102,10 @@ def test_vector_actions_are_the_scalar_ones_row_by_row(name: str) -> None:
     assert (name == "zero") == (not together.any())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_first_observation_is_known_as_the_start_of_an_episode(name: str) -> None:
     """Catches a plan that already moves in its first row taken for the middle of an episode."""
-    env = scalar()
+    env = scalar(name=name)
     observation = first(env)
     policy = baselines.make(name, env)
     action, _ = policy.predict(observation, None)
@@ -266,24 +272,24 @@ def test_unknown_names_are_told_those_of_the_robot() -> None:
         assert "zero, uncompensated, input, dynamic, oracle" in choices
 
 
-@pytest.mark.parametrize("name", NAMES[:-1])
+@pytest.mark.parametrize("name", [name for name in EVERY if name != "oracle"])
 def test_policies_know_the_assumed_model_and_not_the_scenario(name: str) -> None:
     """Catches a policy that is told the true stiffness or mass: the same observations must give the same actions."""
-    worlds = [scalar(), scalar("soft"), scalar("payload")]
+    worlds = [scalar(scenario, name) for scenario in ("nominal", "soft", "payload")]
     inside = worlds[0].unwrapped
     task = SimpleNamespace(observation_table=inside.task.observation_table)
     blind = SimpleNamespace(unwrapped=SimpleNamespace(assumed_model=inside.assumed_model, task=task))
-    actions = [replayed(baselines.make(name, env), recording()[:20]) for env in (*worlds, blind)]
+    actions = [replayed(baselines.make(name, env), recording(name)[:20]) for env in (*worlds, blind)]
     for other in actions[1:]:
         np.testing.assert_array_equal(other, actions[0])
     truth = worlds[1].unwrapped.truth().model
     assert truth.stiffness == pytest.approx(np.full(12, 700.7))  # and soft is soft for somebody
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_only_the_oracle_asks_for_the_truth(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a policy that cheats while it runs, and an oracle that does not look."""
-    env = scalar()
+    env = scalar(name=name)
     truth, asked = env.unwrapped.truth, []
     monkeypatch.setattr(env.unwrapped, "truth", lambda: asked.append(name) or truth())
     run(baselines.make(name, env), env, 3)

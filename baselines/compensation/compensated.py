@@ -23,6 +23,8 @@ class Compensated:
             attribute `reads_rates = False`, which saves their estimate.
         compensator: Where the motor has to lead, and where the link is.
         ramp_s: Duration of the ramp.
+        corrects_policy: Whether a correction of the deflection also reaches the policy, by its `predict_corrected`, as
+            one that winds springs needs it.
     """
 
     def __init__(
@@ -30,8 +32,9 @@ class Compensated:
         policy: Policy,
         compensator: Compensator,
         ramp_s: float = STAND_S,
+        corrects_policy: bool = False,
     ) -> None:
-        self.policy, self.compensator = policy, compensator
+        self.policy, self.compensator, self._corrects_policy = policy, compensator, corrects_policy
         model = compensator.model
         self._num_joints = len(model.joint_names)
         self._shows_rates = getattr(policy, "reads_rates", True)
@@ -74,9 +77,12 @@ class Compensated:
         own = memory[:, 1 + n :]
         links = self._links(compensator, rows, own, correction)
         seen = self._seen(compensator, rows, links)
-        action, inner_state = self.policy.predict(
-            seen if observation.ndim > 1 else seen[0], inner_state, episode_start, deterministic
-        )
+        call = inner_state, episode_start, deterministic
+        shown = seen if observation.ndim > 1 else seen[0]
+        if self._corrects_policy:
+            action, inner_state = self.policy.predict_corrected(shown, correction, *call)  # type: ignore[attr-defined]
+        else:
+            action, inner_state = self.policy.predict(shown, *call)
         action = np.atleast_2d(np.asarray(action, dtype=np.float64))
         offset, kept = compensator.offset(desired.shifted(action), own)
         if correction is not None:

@@ -5,16 +5,16 @@ r"""Links that sensors show, in the place of an output compensator.
 | joint torque sensors | :math:`\delta = K^{-1} \tau_J` with the assumed K, whatever the load | [7], [12] of the paper |
 | link encoders | :math:`\delta = \theta - q`, whatever K and load | [10] of the paper, at the hips alone |
 
-A policy sees θ − δ at once. The command must not lead by δ at once: the command changes the deflection that it answers
-to, by as much as itself where legs that stand form a closed chain, and the robot falls. It leads by the model's
-deflection instead, which `baselines.adaptation` corrects slowly by what is measured.
+A policy sees θ − δ at once. The command must not lead by the measured δ at once: where both feet stand, the legs form a
+closed chain, and δ follows the command by as much as the command changes. The command leads by the model's deflection
+instead, which `baselines.adaptation` corrects slowly by what is measured.
 """
 
 import copy
 
 import numpy as np
 
-from baselines.compensation.compensators import GravityCompensator, Motion
+from baselines.compensation.compensators import Compensator, Motion
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.runtime.robot_model import RobotModel
@@ -32,6 +32,7 @@ class DeflectionSensors:
 
     Attributes:
         has: Which joints have it, (n,).
+        modelled: 1 where δ follows from the assumed K, 0 where it does not, (n,) [1].
 
     Raises:
         ConfigurationError: The observation does not have the sensor.
@@ -46,6 +47,7 @@ class DeflectionSensors:
         self._stiffness, self._is_torque = model.stiffness, sensor == TORQUE_SENSOR
         self._columns, self._encoder = table.group(sensor), table.group("encoder_angle")
         self.has: BoolArray = np.array([any(part in name for part in joints) for name in model.joint_names])
+        self.modelled: Array = np.where(self.has & (sensor == LINK_ENCODER), 0.0, 1.0)
 
     def deflection(self, rows: Array) -> Array:
         """δ = θ − q of observations, (num_worlds, n) [rad]; 0 where a joint has no sensor."""
@@ -54,19 +56,17 @@ class DeflectionSensors:
 
 
 class MeasuredCompensator:
-    """Eq. 9 on the command, and links by sensors where there are any, else by Eq. 12; a `Compensator`.
+    """A compensator whose links are those of sensors where there are any; a `Compensator`.
 
     Args:
-        model: Assumed robot.
-        sensors: Of its joints.
+        base: Compensator for the command, and for the links of joints without a sensor.
+        sensors: Of the joints.
     """
 
-    memory_width = 0
-
-    def __init__(self, model: RobotModel, sensors: DeflectionSensors) -> None:
-        self.model, self._sensors, self._base = model, sensors, GravityCompensator(model)
-        self.modelled = 1.0 - sensors.has
-        self._deflection: Array = np.zeros(len(model.joint_names))
+    def __init__(self, base: Compensator, sensors: DeflectionSensors) -> None:
+        self._base, self._sensors = base, sensors
+        self.model, self.memory_width, self.modelled = base.model, base.memory_width, sensors.modelled
+        self._deflection: Array = np.zeros(len(base.model.joint_names))
 
     def at(self, rows: Array) -> "MeasuredCompensator":
         """See `Compensator`."""

@@ -16,16 +16,16 @@ squares over the time that a foot is loaded tell ρ from c, for roll and pitch o
 import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
-from baselines.estimation.least_squares import UNKNOWNS, least_squares, prior, symmetric
 from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
 """Share of the weight from which an estimate takes a foot for loaded, and flat on the ground."""
-OFFSET_RAD = 0.02
-"""Standard deviation of c before the first measurement."""
+MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
+"""Standard deviations before the first measurement, of ρ and c, and of a measurement."""
 
+_UNKNOWNS = 2  # ρ and c
 _SHAPE = (2, 2)  # legs, roll and pitch
 _FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"))
 _ESTIMATE, _VARIANCES = 8, 12  # per world: (legs, axes, unknowns) and (legs, axes, upper triangle)
@@ -62,24 +62,26 @@ class BendingObserver:
     def begin(self, num_worlds: int) -> Array:
         """Memory before the first measurement, (num_worlds, memory_width)."""
         memory = np.zeros((num_worlds, self.memory_width))
-        memory[:, -_VARIANCES:] = np.tile(prior(OFFSET_RAD), 4)
+        prior = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
+        memory[:, -_VARIANCES:] = np.tile(prior, 4)
         return memory
 
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+    def observe(self, rows: Array, memory: Array, bending: Array | None = None) -> tuple[Array, Array]:
         """Estimates after a measurement, see `signals`, and the new memory.
 
         Args:
             rows: Observations, (num_worlds, m).
             memory: (num_worlds, memory_width).
+            bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under the foot wrenches.
         """
         n = len(rows)
         force = rows[:, self._wrench].reshape(n, 2, 2, 3)[:, :, 0]
         loaded: BoolArray = np.asarray(force[..., 2] >= LOADED_SHARE * self._carried)
         estimate, variances = np.split(memory, [_ESTIMATE], axis=1)
-        seen, expected = self.disagreement(rows, self.bending(rows))
-        x, P = estimate.reshape(n, *_SHAPE, UNKNOWNS), symmetric(variances.reshape(n, *_SHAPE, 3))
-        x, P = least_squares(x, P, expected, seen - expected, loaded[..., None])
-        upper = P[..., *np.triu_indices(UNKNOWNS)].reshape(n, -1)
+        seen, expected = self.disagreement(rows, self.bending(rows) if bending is None else bending)
+        x, P = estimate.reshape(n, *_SHAPE, _UNKNOWNS), _symmetric(variances.reshape(n, *_SHAPE, 3))
+        x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
+        upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
         excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0
         deviation = np.sqrt(P[..., 0, 0].reshape(n, -1))
         return np.hstack([x[..., 0].reshape(n, -1), deviation, excess]), np.hstack([x.reshape(n, -1), upper])
@@ -116,3 +118,17 @@ class BendingObserver:
         R = rotation_of_tilt(attitude).swapaxes(-1, -2)
         up, expected = (np.moveaxis(vector, 0, -1) @ R for vector in pair)
         return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
+
+
+def _symmetric(upper: Array) -> Array:
+    first, mixed, second = np.moveaxis(upper, -1, 0)
+    return np.stack([np.stack([first, mixed], axis=-1), np.stack([mixed, second], axis=-1)], axis=-2)
+
+
+def _least_squares(x: Array, P: Array, expected: Array, excess: Array, valid: BoolArray) -> tuple[Array, Array]:
+    """One step of recursive least squares for excess = ρ · expected + c, where it is valid."""
+    h = np.stack([expected, np.ones_like(expected)], axis=-1)
+    Ph = (P @ h[..., None])[..., 0]
+    gain = Ph / ((h * Ph).sum(axis=-1) + DISAGREEMENT_RAD**2)[..., None] * valid[..., None]
+    x = x + gain * (excess - (h * x).sum(axis=-1))[..., None]
+    return x, P - gain[..., :, None] * Ph[..., None, :]

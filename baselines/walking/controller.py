@@ -43,10 +43,9 @@ class WalkingGains(Model):
     velocity_filter_s: float = quantity("s", 0.05, gt=0, description="time constant of the COM velocity")
     zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
     friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0, description="joint rate at which friction acts in full")
-    weighs: bool = False
-    """Whether the force difference is a share of the mean load of the feet, else of the assumed weight: then a load on
-    the robot shortens the leg that carries it."""
-    weighing_s: float = quantity("s", 1.0, gt=0, description="time constant of that mean")
+    weight_filter_s: float | None = None
+    """Time constant with which the weight is measured that the force difference is a share of [s]; None takes the
+    assumed weight, with which a load on the robot shortens the leg that carries it."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
 class WalkingController:
     """Commands a walker around its plan, see the module.
 
-    Memory per world: steps, leg length difference, COM from both soles, deviation of its velocity, ZMP shift.
+    Memory per world: steps, leg length difference, COM from both soles, deviation of its velocity, ZMP shift, weight.
 
     Args:
         model: Assumed walker.
@@ -110,13 +109,20 @@ class WalkingController:
         self._friction_deflection = model.coulomb_friction / model.stiffness
 
     def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Offsets of the twelve joints [rad], and new state."""
+        return self.predict_corrected(observation, None, state, episode_start, deterministic)
+
+    def predict_corrected(
         self,
         observation: Array,
+        correction: Array | None,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,  # noqa: ARG002
     ) -> tuple[Action, Any]:
-        """Offsets of the twelve joints [rad], and new state."""
+        """`predict` with springs that are wound by 1 + r times as much; r as `baselines.Compensated` has it."""
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(frame))
@@ -124,15 +130,17 @@ class WalkingController:
         steps = steps + 1.0
         share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)
         row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
-        if self._gains.weighs:
+        if self._gains.weight_filter_s is not None:
             load = self._vertical_forces(rows).sum(axis=1, keepdims=True) + self._weight_of_feet
-            weight = weight + _share(self._dt, self._gains.weighing_s) * (load - weight)
+            weight = weight + _share(self._dt, self._gains.weight_filter_s) * (load - weight)
         z = self._leg_difference(rows, row, z, weight)
         coms = frame.com_from_soles[..., :2]
         if self._com_feedback:
             velocity, shift = self._zmp_shift(rows, row, coms, last.reshape(coms.shape), velocity, shift)
-        feedback = share * (self._leg_offsets(rows, z) + self._ankle_offsets(rows, shift))
-        action = feedback + self._friction_offsets(rows)
+        at_ankles, against_friction = self._ankle_offsets(rows, shift), self._friction_offsets(rows)
+        if correction is not None:
+            at_ankles, against_friction = (1.0 + correction) * at_ankles, (1.0 + correction) * against_friction
+        action = share * (self._leg_offsets(rows, z) + at_ankles) + against_friction
         kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, weight])
         action = action.astype(np.float32)
         return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)

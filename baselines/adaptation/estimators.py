@@ -1,0 +1,113 @@
+r"""By how much the joints bend more than the model says, r, from what a robot measures.
+
+| estimator | measures | 1 + r |
+|---|---|---|
+| `LegEstimator` | encoders, foot sensors, IMU | (1 + ρ_roll) (1 + μ) for all joints of a leg but yaw |
+| the same | also joint torques | (1 + ρ_roll) (1 + μ) for rolls, (1 + ρ_pitch) (1 + μ) for pitches |
+| `EncoderEstimator` | also link encoders | (1 + r_j) (1 + μ) joint by joint |
+
+ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the feet. Without torque
+sensors ρ of pitch is left out: friction hides the bending there. Joints without a link encoder have r_j = 0.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from baselines.compensation.measured import DeflectionSensors
+from baselines.estimation.bending import BendingObserver
+from baselines.estimation.joint_stiffness import JointStiffnessObserver
+from elastic_env.core.signals import Array, SignalTable
+from elastic_env.runtime.robot_model import WalkerModel
+
+_SEEN = SignalTable(BendingObserver.signals)
+_ERROR = _SEEN.group("model_error")
+_LOAD = _SEEN.names.index("excess_load")
+_ROLL, _PITCH = 0, 1
+_AXIS = np.array([_ROLL, _ROLL, _PITCH, _PITCH, _PITCH, _ROLL])  # of the joints of a leg
+_BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
+_PRIOR_LOADS = 5.0
+"""Number of measurements that the assumed load counts for."""
+
+
+class Estimator(Protocol):
+    """Estimates r from observations."""
+
+    memory_width: int
+
+    def begin(self, num_worlds: int) -> Array:
+        """Memory before the first estimate, (num_worlds, memory_width)."""
+        ...
+
+    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """The correction r of every joint, (num_worlds, n) [1], and the new memory."""
+        ...
+
+
+class LegEstimator:
+    """r of each leg by motors, foot sensors and IMU, and joint torques where there are any; see the module.
+
+    Memory per world: number and sum of the measured excess loads, then that of the observer.
+
+    Args:
+        model: Assumed walker.
+        sensors: Joint torque sensors, if it has them.
+    """
+
+    def __init__(self, model: WalkerModel, sensors: DeflectionSensors | None = None) -> None:
+        self._observer, self._sensors = BendingObserver(model), sensors
+        self._axis = np.zeros_like(_AXIS) if sensors is None else _AXIS
+        self.memory_width = 2 + self._observer.memory_width
+
+    def begin(self, num_worlds: int) -> Array:
+        """See `Estimator`."""
+        return np.hstack([np.zeros((num_worlds, 2)), self._observer.begin(num_worlds)])
+
+    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """See `Estimator`."""
+        bending = None if self._sensors is None else self._sensors.deflection(rows)
+        seen, kept = self._observer.observe(rows, memory[:, 2:], bending)
+        load, loads = mean_load(memory[:, :2], seen[:, [_LOAD]])
+        error = seen[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
+        joints = (((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _BENDS).reshape(len(rows), -1)
+        return joints, np.hstack([loads, kept])
+
+
+class EncoderEstimator:
+    """r of each joint by link encoders; joints that have none take part in the load alone. See the module.
+
+    Memory per world: number and sum of the measured excess loads, then that of the observer.
+
+    Args:
+        model: Assumed walker.
+        sensors: Its link encoders.
+    """
+
+    def __init__(self, model: WalkerModel, sensors: DeflectionSensors) -> None:
+        self._sensors, self._observer = sensors, JointStiffnessObserver(model)
+        table, above = model.observation_table, model.biped.chains_above_feet
+        self._wrench, self._carried = table.group("wrench"), above.mass * model.biped.gravity
+        self.memory_width = 2 + self._observer.memory_width
+
+    def begin(self, num_worlds: int) -> Array:
+        """See `Estimator`."""
+        return np.hstack([np.zeros((num_worlds, 2)), self._observer.begin(num_worlds)])
+
+    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """See `Estimator`."""
+        has = self._sensors.has
+        error, kept = self._observer.observe(rows, self._sensors.deflection(rows), has, memory[:, 2:])
+        force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
+        load, loads = mean_load(memory[:, :2], force.sum(axis=1, keepdims=True) / self._carried - 1.0)
+        return (1.0 + has * error) * (1.0 + load) - 1.0, np.hstack([loads, kept])
+
+
+def mean_load(memory: Array, excess: Array) -> tuple[Array, Array]:
+    """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum of measurements.
+
+    Args:
+        memory: Number and sum, (num_worlds, 2).
+        excess: Measured over assumed load less one, (num_worlds, 1) [1].
+    """
+    memory = memory + np.hstack([np.ones_like(excess), excess])
+    return memory[:, 1:] / (_PRIOR_LOADS + memory[:, :1]), memory
