@@ -62,11 +62,11 @@ GROUPS = (
     _of("encoder_rate", "rad/s", "its change over the last control period, {part}", JOINTS, "measured"),
     _of(
         "imu_attitude", "rad", "{part} of the pelvis by its IMU", _TURNS, "measured",
-        noise=lambda scenario: scenario.pelvis_imu.noise_rad,
+        noise=lambda scenario: scenario.pelvis_noise_rad,
     ),
     _of(
         "imu_rate", "rad/s", "gyroscope of the pelvis about its {part}", _RATES, "measured",
-        noise=lambda scenario: scenario.gyro_noise_rad_s,
+        noise=lambda scenario: scenario.pelvis_gyro_noise_rad_s,
     ),
     SignalGroup(
         "wrench", _wrenches(), shape=(2, 2, 3),
@@ -81,6 +81,15 @@ GROUPS = (
     _of("last_command", "rad", "θ_cmd of the last control period, {part}", JOINTS, "command"),
 )  # fmt: skip
 """The observation; what a sensor shows, its noise and its mirror image are said here alone."""
+
+INERTIAL_GROUPS = (
+    _of(
+        "specific_force", "m/s²", "accelerometer within an inertial IMU, along its {part}",
+        {"x": "same", "y": "opposite", "z": "same"}, "measured",
+        noise=lambda scenario: 0.0 if scenario.inertial is None else scenario.inertial.accelerometer_noise_m_s2,
+    ),
+)  # fmt: skip
+"""What an inertial IMU measures and nobody observes: its filter makes the attitude of it."""
 
 OBSERVATION = SignalTable.of(GROUPS)
 
