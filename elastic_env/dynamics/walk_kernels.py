@@ -44,18 +44,11 @@ class Walker(NamedTuple):
     bias: Any
 
 
-class Samples(NamedTuple):
+class Noise(NamedTuple):
     """Standard normal samples ahead, (block, n), and how many of each world's are used, (n,), which is counted here."""
 
     samples: Any
     used: IntArray
-
-
-class Noise(NamedTuple):
-    """Of the sensors, and of the accelerometer in an inertial IMU, which nobody draws where there is none."""
-
-    sensors: Samples
-    accelerometer: Samples
 
 
 class Outcome(NamedTuple):
@@ -84,7 +77,7 @@ def begin(physics: Physics, walker: Walker, noise: Noise, worlds: BoolArray, row
             truth, shown = rows[world].truth, rows[world].measured
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            drawn, bias = sample_of(noise.sensors, world), walker.bias[world]
+            drawn, bias = sample_of(noise, world), walker.bias[world]
             if constants.quality.inertial.is_fitted:
                 settle_imu(truth, drawn, bias, constants.quality, shown)
             measure(truth, drawn, bias, constants.quality, True, shown)
@@ -123,10 +116,9 @@ def control_step(
         if not diverged[world]:
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            drawn, bias = sample_of(noise.sensors, world), walker.bias[world]
+            drawn, bias = sample_of(noise, world), walker.bias[world]
             if constants.quality.inertial.is_fitted:
-                further = sample_of(noise.accelerometer, world)
-                advance_imu(last[world].truth, truth, (drawn, further), bias, constants, shown)
+                advance_imu(last[world].truth, truth, drawn, bias, constants, shown)
             measure(truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
         watch_swing_foot(truth, planned, rules.loaded_n)
         is_last = truth.step >= len(walker.plan) - 1
@@ -154,7 +146,7 @@ def row_of(plan: Any, step: int) -> Any:
 
 
 @compiled
-def sample_of(noise: Samples, world: int) -> Any:
+def sample_of(noise: Noise, world: int) -> Any:
     """The next sample of a world."""
     used = noise.used[world]
     noise.used[world] += 1
@@ -247,17 +239,24 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
             shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
             shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
     if imu_is_due:
-        roll, pitch = row.roll, row.pitch
         if quality.inertial.is_fitted:
-            roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
-        for i, angle in enumerate((roll, pitch)):
+            show_inertial(bias, quality, shown)
+            return
+        for i, angle in enumerate((row.roll, row.pitch)):
             drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
             shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], drawn, quality)
         for i in range(3):
-            if quality.inertial.is_fitted:
-                shown.imu_rate[i] = shown.imu_gyro[i]
-            else:
-                shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
+            shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
+
+
+@compiled
+def show_inertial(bias: Any, quality: Any, shown: Any) -> None:
+    """What an inertial IMU shows of its own state: noise is in it, errors of the mounting come on top."""
+    roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
+    for i, angle in enumerate((roll, pitch)):
+        shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], 0.0, quality)
+    for i in range(3):
+        shown.imu_rate[i] = shown.imu_gyro[i]
 
 
 @compiled
@@ -272,25 +271,27 @@ def settle_imu(row: Any, noise: Any, bias: Any, quality: Any, shown: Any) -> Non
 
 
 @compiled
-def advance_imu(before: Any, row: Any, noise: tuple[Any, Any], bias: Any, constants: Any, shown: Any) -> None:
+def advance_imu(before: Any, row: Any, noise: Any, bias: Any, constants: Any, shown: Any) -> None:
     """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical by its filter.
 
     Args:
         before: Truth at the beginning of the period.
         row: And at its end.
-        noise: Samples of the sensors, and of the accelerometer.
+        noise: Sample of the sensors; that of the attitude is of the accelerometer, across the vertical.
         bias: Of the world.
         constants: One row of `CONSTANTS`.
         shown: Measurements, whose `imu_gyro` and `imu_up` are brought up to date.
     """
     quality, period_s = constants.quality, constants.rules.control_period_s
-    drawn, further = noise
     force, turned = np.empty(3), np.empty(3)
     specific_force(before, row, period_s, quality.inertial.gravity_m_s2, force)
     rotation_between(before.quaternion, row.quaternion, turned)
+    # a force to the left is a positive roll, one forward a negative pitch
+    force[0] -= quality.inertial.gravity_m_s2 * quality.noise.imu_attitude[1] * noise.imu_attitude[1]
+    force[1] += quality.inertial.gravity_m_s2 * quality.noise.imu_attitude[0] * noise.imu_attitude[0]
     for i in range(3):
-        force[i] += bias.specific_force[i] + further.specific_force[i] * quality.inertial.noise.specific_force[i]
-        rate = turned[i] / period_s + bias.gyro[i] + drawn.imu_rate[i] * quality.noise.imu_rate[i]
+        force[i] += bias.specific_force[i]
+        rate = turned[i] / period_s + bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
         shown.imu_gyro[i], turned[i] = rate, rate * period_s
     complementary_filter(shown.imu_up, turned, force, 1.0 - math.exp(-period_s / quality.inertial.time_constant_s))
 

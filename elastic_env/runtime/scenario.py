@@ -63,8 +63,8 @@ class Scenario(Model):
 
     @property
     def pelvis_noise_rad(self) -> float:
-        """Walker: standard deviation of the white noise on the attitude; an inertial IMU has none beyond its own."""
-        return self.pelvis_imu.noise_rad if self.inertial is None else 0.0
+        """Walker: standard deviation of the noise of roll and pitch, in an inertial IMU before its filter."""
+        return self.pelvis_imu.noise_rad if self.inertial is None else self.inertial.accelerometer_noise_rad
 
     @property
     def pelvis_gyro_noise_rad_s(self) -> float:

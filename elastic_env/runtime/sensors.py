@@ -88,9 +88,12 @@ class InertialSensor(Model):
         return self.gyro_noise_density * math.sqrt(self.bandwidth_hz)
 
     @property
-    def accelerometer_noise_m_s2(self) -> float:
-        """Standard deviation of the accelerometer's mean over a control period [m/s²]."""
-        return self.accelerometer_noise_density * math.sqrt(self.bandwidth_hz)
+    def accelerometer_noise_rad(self) -> float:
+        """Standard deviation of roll and pitch by the accelerometer's mean over a control period [rad].
+
+        Only noise across the vertical tilts the attitude, that along it has no effect to first order.
+        """
+        return self.accelerometer_noise_density * math.sqrt(self.bandwidth_hz) / STANDARD_GRAVITY_M_S2
 
     @property
     def offset_rad(self) -> float:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.model import LEG_JOINTS
-from elastic_env.robots.thormang.tables import GROUPS, INERTIAL_GROUPS
+from elastic_env.robots.thormang.tables import GROUPS
 from elastic_env.runtime.robot_model import WalkerModel
 
 Records: TypeAlias = npt.NDArray[Any]
@@ -62,9 +62,6 @@ MEASURED = record_type(
 NOISE = record_type(*((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None))
 """Standard normal samples of a control step [1], or their standard deviations in the units of the signals."""
 
-ACCELEROMETER_NOISE = record_type(*((group.name, REAL, group.shape) for group in INERTIAL_GROUPS))
-"""As `NOISE`, of what an inertial IMU measures and does not show."""
-
 BIAS = record_type(
     ("encoder", REAL, NUM_JOINTS), ("imu_attitude", REAL, 2),  # of homing and mounting [rad]
     ("gyro", REAL, 3), ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
@@ -85,11 +82,7 @@ ROW_OF_PLAN = record_type(
 )  # fmt: skip
 """What a control step needs of the plan."""
 
-INERTIAL = record_type(
-    ("is_fitted", np.bool_),
-    ("time_constant_s", REAL), ("gravity_m_s2", REAL),
-    ("noise", ACCELEROMETER_NOISE),  # standard deviations
-)  # fmt: skip
+INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
 """An inertial IMU; where none is fitted, the attitude comes with the errors that `QUALITY` has for it."""
 
 QUALITY = record_type(

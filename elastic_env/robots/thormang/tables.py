@@ -82,15 +82,6 @@ GROUPS = (
 )  # fmt: skip
 """The observation; what a sensor shows, its noise and its mirror image are said here alone."""
 
-INERTIAL_GROUPS = (
-    _of(
-        "specific_force", "m/s²", "accelerometer within an inertial IMU, along its {part}",
-        {"x": "same", "y": "opposite", "z": "same"}, "measured",
-        noise=lambda scenario: 0.0 if scenario.inertial is None else scenario.inertial.accelerometer_noise_m_s2,
-    ),
-)  # fmt: skip
-"""What an inertial IMU measures and nobody observes: its filter makes the attitude of it."""
-
 OBSERVATION = SignalTable.of(GROUPS)
 
 FELL = "fell"

@@ -55,7 +55,6 @@ plan's world frame, x forward, y to the left:
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -80,7 +79,6 @@ from elastic_env.robots.thormang.config import (
 )
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, biped
 from elastic_env.robots.thormang.rows import (
-    ACCELEROMETER_NOISE,
     ADDRESSES,
     BIAS,
     CONSTANTS,
@@ -97,16 +95,7 @@ from elastic_env.robots.thormang.rows import (
     WalkTruth,
     one,
 )
-from elastic_env.robots.thormang.tables import (
-    ACTION,
-    FELL,
-    GROUPS,
-    INERTIAL_GROUPS,
-    JOINTS,
-    METRICS,
-    OBSERVATION,
-    PHASES,
-)
+from elastic_env.robots.thormang.tables import ACTION, FELL, GROUPS, JOINTS, METRICS, OBSERVATION, PHASES
 from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
@@ -126,8 +115,8 @@ class WalkTask(Stateful):
     """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.runtime.task.Task`."""
 
     STATE = (
-        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_accelerometer_noise", "_sensors", "_rows",
-        "_shown", "_offset", "_has_fallen",
+        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_sensors", "_rows", "_shown", "_offset",
+        "_has_fallen",
     )  # fmt: skip
 
     name = "walker"
@@ -187,9 +176,6 @@ class WalkTask(Stateful):
         self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
         self._noise = NoiseStream(n, NOISE)
-        has_inertial = config.scenario.inertial is not None
-        self._accelerometer_noise = NoiseStream(n, ACCELEROMETER_NOISE) if has_inertial else None
-        self._unused = _no_samples(n, ACCELEROMETER_NOISE)
         self._rows = self._shown = np.zeros(n, STEP)
         self._rows_ahead, self._rows_left = np.zeros((0, n), STEP), 0
         self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
@@ -228,11 +214,8 @@ class WalkTask(Stateful):
 
     def _rehearse(self, simulation: Simulation) -> None:
         """Call all kernels on rows of their own."""
-        n, rows = self.num_worlds, np.zeros((2, self.num_worlds), STEP)
-        noise, physics = (
-            kernels.Noise(_no_samples(n, NOISE), _no_samples(n, ACCELEROMETER_NOISE)),
-            self._physics(simulation),
-        )
+        n, rows, samples = self.num_worlds, np.zeros((2, self.num_worlds), STEP), np.zeros((1, self.num_worlds), NOISE)
+        noise, physics = kernels.Noise(samples, np.zeros(n, dtype=np.int64)), self._physics(simulation)
         commanded, outcome = (self._offset, np.zeros(n, dtype=np.bool_)), _outcome(n)
         kernels.begin(physics, self._walker, noise, ~commanded[1], rows[0])
         kernels.command(rows[0], self._offset, self._walker, np.zeros_like(simulation.ctrl))
@@ -377,9 +360,7 @@ class WalkTask(Stateful):
 
     def _ready(self) -> kernels.Noise:
         """Noise of the sensors ahead."""
-        further = self._accelerometer_noise
-        of_accelerometer = self._unused if further is None else kernels.Samples(*further.ready())
-        return kernels.Noise(kernels.Samples(*self._noise.ready()), of_accelerometer)
+        return kernels.Noise(*self._noise.ready())
 
     def _draw_push(self, world: int, generator: np.random.Generator) -> None:
         """Time and direction of the push, in the walk."""
@@ -392,11 +373,10 @@ class WalkTask(Stateful):
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
         sensor, bias = self.config.scenario.inertial, self._bias
-        if sensor is not None and self._accelerometer_noise is not None:
+        if sensor is not None:
             bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
             bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
             bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
-            self._accelerometer_noise.restart(world, np.random.default_rng(generator.integers(2**63)))
 
     def _place(self, simulation: Simulation, world: int) -> Array:
         """Give a world its robot, at rest; its true K, (12,) [N·m/rad]."""
@@ -451,11 +431,6 @@ def _halves_of_swing(plan: WalkPlan) -> IntArray:
     return np.where(timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0)
 
 
-def _no_samples(n: int, kind: np.dtype[Any]) -> kernels.Samples:
-    """Of a noise that is not drawn."""
-    return kernels.Samples(np.zeros((1, n), kind), np.zeros(n, dtype=np.int64))
-
-
 def _outcome(n: int) -> kernels.Outcome:
     """To be filled."""
     return kernels.Outcome(np.empty(n, OBSERVED), np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_))
@@ -474,19 +449,17 @@ def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
 
 def _quality(scenario: Scenario, counts_per_turn: int | None, gravity_m_s2: float) -> Records:
     """Quality of the sensors in a scenario, one row of `QUALITY`."""
-    imu, noise, further = scenario.pelvis_imu, np.zeros(1, NOISE), np.zeros(1, ACCELEROMETER_NOISE)
-    for groups, deviations in ((GROUPS, noise), (INERTIAL_GROUPS, further)):
-        for group in groups:
-            if group.noise is not None:
-                deviations[group.name] = group.noise(scenario)
+    imu, noise = scenario.pelvis_imu, np.zeros(1, NOISE)
+    for group in GROUPS:
+        if group.noise is not None:
+            noise[group.name] = group.noise(scenario)
     inertial = one(
-        INERTIAL, is_fitted=scenario.inertial is not None, gravity_m_s2=gravity_m_s2, noise=further,
+        INERTIAL, is_fitted=scenario.inertial is not None, gravity_m_s2=gravity_m_s2,
         time_constant_s=1.0 if scenario.inertial is None else scenario.inertial.time_constant_s,
     )  # fmt: skip
     return one(
         QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None), noise=noise,
-        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
-        inertial=inertial,
+        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad, inertial=inertial,
     )  # fmt: skip
 
 
