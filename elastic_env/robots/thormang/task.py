@@ -7,8 +7,8 @@ then the same of the right leg (r_...); a name before a dot has one column per j
 |---|---|---|---|
 | 0 to 11 | `encoder_angle.<joint>` | rad | motor encoder, θ in whole counts |
 | 12 to 23 | `encoder_rate.<joint>` | rad/s | its change over the last control period |
-| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis |
-| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis |
+| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis; in the scenario `imu` by its own filter |
+| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis; in `imu` a period's mean |
 | 29 to 31 | `wrench.l_fx`, `.l_fy`, `.l_fz` | N | left ankle sensor: force of foot on leg, in the foot's frame |
 | 32 to 34 | `wrench.l_mx`, `.l_my`, `.l_mz` | N·m | moment about the ankle, likewise |
 | 35 to 40 | `wrench.r_fx` to `.r_mz` | N, N·m | right ankle sensor |
