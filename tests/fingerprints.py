@@ -1,17 +1,19 @@
 """Digests of what environments and policies produce, to notice a changed bit.
 
 `python -m tests.fingerprints check` plays all cases, of which the tests play half. `python -m tests.fingerprints write`
-writes fingerprints.json anew. Do that only where results are meant to change.
+writes fingerprints.json anew. Do that only where results are meant to change. `python -m tests.fingerprints add TEXT`
+adds the new cases whose names hold a text, and leaves the others as they are.
 
 Bits depend on the processor too: BLAS and NumPy choose their instructions by it. `numerics` is a digest of a small
-calculation without this project. Where it differs from the recorded one, `Fingerprint.levels` are compared instead.
+calculation without this project. Where it differs from the recorded one, `Fingerprint.levels` are compared instead. A
+case that was added on another processor than the others has a digest of its own.
 """
 
 import hashlib
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +54,8 @@ class Fingerprint:
 
     digest: str
     levels: dict[str, float]
+    numerics: str = ""
+    """Of the processor that recorded it; empty for that of the whole file."""
 
 
 def cases() -> list[Case]:
@@ -137,10 +141,25 @@ def recorded() -> tuple[str, dict[str, Fingerprint]]:
     return content["numerics"], {name: Fingerprint(**values) for name, values in content["cases"].items()}
 
 
+def _as_recorded(found: Fingerprint) -> dict[str, Any]:
+    return {key: value for key, value in asdict(found).items() if value != ""}
+
+
 def write() -> None:
     """Record all cases anew."""
-    found = {case.name: asdict(fingerprint(case)) for case in cases()}
+    found = {case.name: _as_recorded(fingerprint(case)) for case in cases()}
     RECORDED.write_text(json.dumps({"numerics": numerics(), "cases": found}, indent=0) + "\n")
+
+
+def add(text: str) -> list[str]:
+    """Record the cases that are new and whose names hold a text; their names."""
+    content, here = json.loads(RECORDED.read_text()), numerics()
+    added = [case for case in cases() if text in case.name and case.name not in content["cases"]]
+    for case in added:
+        found = replace(fingerprint(case), numerics="" if here == content["numerics"] else here)
+        content["cases"][case.name] = _as_recorded(found)
+    RECORDED.write_text(json.dumps(content, indent=0) + "\n")
+    return [case.name for case in added]
 
 
 def check() -> list[str]:
@@ -152,6 +171,8 @@ def check() -> list[str]:
 if __name__ == "__main__":
     if sys.argv[1:] == ["write"]:
         write()
+    elif sys.argv[1:2] == ["add"]:
+        print("\n".join(add(sys.argv[2])))
     elif sys.argv[1:] == ["check"]:
         sys.exit("\n".join(check()) or 0)
     else:

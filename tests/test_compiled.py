@@ -171,7 +171,7 @@ def test_division_by_zero_is_as_in_numpy() -> None:
     assert np.isnan(compiled(lambda value: value / 0.0)(0.0))
 
 
-@pytest.mark.parametrize("scenario", ["nominal", "sensor", "spread"])
+@pytest.mark.parametrize("scenario", ["nominal", "sensor", "spread", "imu"])
 def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches code that is compiled to something else, and what was compiled before a change."""
     worlds = gymnasium.make_vec("elastic_env/WalkInPlace-v0", num_envs=2, scenario=scenario)

@@ -20,7 +20,7 @@ def test_a_rollout_is_that_of_before(case: Case) -> None:
     """The same bits; on a processor that calculates otherwise, the same sums."""
     processor, known = recorded()
     found = fingerprint(case)
-    if numerics() == processor:
+    if numerics() == (known[case.name].numerics or processor):
         assert found.digest == known[case.name].digest
     for name, level in known[case.name].levels.items():
         np.testing.assert_allclose(found.levels[name], level, rtol=1e-5, atol=1e-9, err_msg=name)

@@ -36,7 +36,13 @@ def settled(info: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize(
     ("robot", "worlds", "scenario"),
-    [("testbed", 1, "sensor"), ("testbed", 3, "nominal"), ("walker", 1, "spread"), ("walker", 3, "push")],
+    [
+        ("testbed", 1, "sensor"),
+        ("testbed", 3, "nominal"),
+        ("walker", 1, "spread"),
+        ("walker", 3, "push"),
+        ("walker", 1, "imu"),
+    ],
 )
 def test_a_copy_in_the_midst_of_an_episode_goes_on_bit_for_bit(
     how: str, robot: str, worlds: int, scenario: str

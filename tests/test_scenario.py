@@ -9,7 +9,7 @@ import pytest
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.runtime.scenario import Scenario, make_scenario
-from elastic_env.runtime.sensors import AttitudeSensor
+from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
 
 
 @pytest.mark.parametrize("scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"])
@@ -33,7 +33,7 @@ def test_scenarios_that_draw_nothing_are_known_by_their_episodes(scenario: str) 
         {"pelvis_imu": AttitudeSensor(noise_rad=1e-3)}, {"pelvis_imu": AttitudeSensor(bias_spread_rad=1e-3)},
         {"gyro_noise_rad_s": 1e-3}, {"force_noise_n": 1.0}, {"moment_noise_nm": 0.1}, {"encoder_bias_rad": 1e-3},
         {"stiffness_spread": 0.3}, {"slope_rad": 0.01}, {"delay_steps": 1},
-        {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)},
+        {"pelvis_imu": AttitudeSensor(bias_rad=1e-3)}, {"inertial": InertialSensor()},
     ],
     ids=lambda alone: "-".join(alone),
 )  # fmt: skip

@@ -189,6 +189,18 @@ def test_record_of_a_walk_names_its_cell_and_agrees_with_its_trace() -> None:
     assert {metric.name for metric in task.metrics} <= record.keys()
     assert "frame_error_mean_m" not in record  # one step, no change of the support foot
     assert record["link_estimate_error_rms_rad"] > 0.0
+    # roll and pitch, with noise of 0.2 mrad each
+    assert record["imu_error_rms_rad"] == pytest.approx(0.2e-3 * np.sqrt(2.0), rel=0.15)
+
+
+def test_the_error_of_the_imu_is_that_of_roll_and_pitch_in_the_walk() -> None:
+    """Catches an error against another step's truth, one axis alone, and standing that counts."""
+    exact, off = (
+        evaluate(walk("zero", scenario=scenario), num_threads=1).episodes[0]["imu_error_rms_rad"]
+        for scenario in ("ideal", "imu")
+    )
+    assert exact < 1e-12
+    assert 1e-3 < off < 2e-2
 
 
 class Blind:
@@ -261,7 +273,7 @@ def test_tables_say_median_worst_and_falls() -> None:
     first, second = (
         line for line in text.splitlines() if line.startswith("| 0.3+0.5+0.3 s num_steps=1 | nominal | input |")
     )
-    assert first.count("3.00 (4.00)") == 4  # roll and pitch
+    assert first.count("3.00 (4.00)") == 5  # roll, pitch and IMU
     assert second.count("(4.00)") == 9  # roll, pitch and ZMP in three phases
     assert first.endswith("| 1/4 |")
     assert second.endswith("| 1/4 |")

@@ -77,7 +77,10 @@ def begin(physics: Physics, walker: Walker, noise: Noise, worlds: BoolArray, row
             truth, shown = rows[world].truth, rows[world].measured
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            measure(truth, sample_of(noise, world), walker.bias[world], constants.quality, True, shown)
+            drawn, bias = sample_of(noise, world), walker.bias[world]
+            if constants.quality.inertial.is_fitted:
+                settle_imu(truth, drawn, bias, constants.quality, shown)
+            measure(truth, drawn, bias, constants.quality, True, shown)
             shown.encoder_before[:] = shown.encoder
 
 
@@ -113,8 +116,10 @@ def control_step(
         if not diverged[world]:
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            bias = walker.bias[world]
-            measure(truth, sample_of(noise, world), bias, constants.quality, planned.imu_is_due, shown)
+            drawn, bias = sample_of(noise, world), walker.bias[world]
+            if constants.quality.inertial.is_fitted:
+                advance_imu(last[world].truth, truth, drawn, bias, constants, shown)
+            measure(truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
         watch_swing_foot(truth, planned, rules.loaded_n)
         is_last = truth.step >= len(walker.plan) - 1
         is_over = end(truth, rules, diverged[world], is_last, outcome.ends[:, world]) or is_over
@@ -168,7 +173,7 @@ def read(physics: Physics, at: Any, world: int, row: Any) -> None:
         row.q[i], row.q_dot[i] = qpos[at.q[i]], qvel[at.q_dot[i]]
         row.servo_torque[i] = physics.actuator_force[world, i]
     for i in range(3):
-        row.pelvis[i], row.pelvis_rate[i] = qpos[i], qvel[3 + i]
+        row.pelvis[i], row.pelvis_velocity[i], row.pelvis_rate[i] = qpos[i], qvel[i], qvel[3 + i]
     for i in range(4):
         row.quaternion[i] = qpos[3 + i]
     for foot in range(2):
@@ -184,7 +189,12 @@ def attitude_of(quaternion: Array) -> tuple[float, float, float]:
     """Roll and pitch (of yaw, pitch, roll), and the angle between z axis and vertical [rad]."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # the vertical in the frame of the pelvis
-    up_x, up_y, up_z = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+    return attitude_by(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+
+
+@compiled
+def attitude_by(up_x: float, up_y: float, up_z: float) -> tuple[float, float, float]:
+    """As `attitude_of`, by the vertical in the frame that is tilted, a unit vector [1]."""
     pitch = math.asin(min(max(-up_x, -1.0), 1.0))
     return math.atan2(up_y, up_z), pitch, math.atan2(math.hypot(up_x, up_y), up_z)
 
@@ -229,11 +239,134 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
             shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
             shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
     if imu_is_due:
+        if quality.inertial.is_fitted:
+            show_inertial(bias, quality, shown)
+            return
         for i, angle in enumerate((row.roll, row.pitch)):
             drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
             shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], drawn, quality)
         for i in range(3):
             shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
+
+
+@compiled
+def show_inertial(bias: Any, quality: Any, shown: Any) -> None:
+    """What an inertial IMU shows of its own state: noise is in it, errors of the mounting come on top."""
+    roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
+    for i, angle in enumerate((roll, pitch)):
+        shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], 0.0, quality)
+    for i in range(3):
+        shown.imu_rate[i] = shown.imu_gyro[i]
+
+
+@compiled
+def settle_imu(row: Any, noise: Any, bias: Any, quality: Any, shown: Any) -> None:
+    """An inertial IMU that has been at rest for long: its filter has settled, a bias of the gyroscope included."""
+    inertial, force = quality.inertial, np.empty(3)
+    specific_force(row, row, 1.0, inertial.gravity_m_s2, force)
+    for i in range(3):
+        force[i] += bias.specific_force[i]
+        shown.imu_gyro[i] = bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
+    settled_vertical(shown.imu_up, force, bias.gyro, inertial.time_constant_s)
+
+
+@compiled
+def advance_imu(before: Any, row: Any, noise: Any, bias: Any, constants: Any, shown: Any) -> None:
+    """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical by its filter.
+
+    Args:
+        before: Truth at the beginning of the period.
+        row: And at its end.
+        noise: Sample of the sensors; that of the attitude is of the accelerometer, across the vertical.
+        bias: Of the world.
+        constants: One row of `CONSTANTS`.
+        shown: Measurements, whose `imu_gyro` and `imu_up` are brought up to date.
+    """
+    quality, period_s = constants.quality, constants.rules.control_period_s
+    force, turned = np.empty(3), np.empty(3)
+    specific_force(before, row, period_s, quality.inertial.gravity_m_s2, force)
+    rotation_between(before.quaternion, row.quaternion, turned)
+    # a force to the left is a positive roll, one forward a negative pitch
+    force[0] -= quality.inertial.gravity_m_s2 * quality.noise.imu_attitude[1] * noise.imu_attitude[1]
+    force[1] += quality.inertial.gravity_m_s2 * quality.noise.imu_attitude[0] * noise.imu_attitude[0]
+    for i in range(3):
+        force[i] += bias.specific_force[i]
+        rate = turned[i] / period_s + bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
+        shown.imu_gyro[i], turned[i] = rate, rate * period_s
+    complementary_filter(shown.imu_up, turned, force, 1.0 - math.exp(-period_s / quality.inertial.time_constant_s))
+
+
+@compiled
+def specific_force(before: Any, row: Any, period_s: float, gravity_m_s2: float, force: Array) -> None:
+    """Mean specific force over a period, acceleration minus gravity, in the frame at its end: into `force` [m/s²]."""
+    w, x, y, z = row.quaternion[0], row.quaternion[1], row.quaternion[2], row.quaternion[3]
+    a = (row.pelvis_velocity[0] - before.pelvis_velocity[0]) / period_s
+    b = (row.pelvis_velocity[1] - before.pelvis_velocity[1]) / period_s
+    c = (row.pelvis_velocity[2] - before.pelvis_velocity[2]) / period_s + gravity_m_s2
+    force[0] = (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c
+    force[1] = 2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c
+    force[2] = 2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c
+
+
+@compiled
+def rotation_between(before: Array, after: Array, turned: Array) -> None:
+    """Rotation vector from one unit quaternion to another, in the frame that turns: into `turned`, (3,) [rad]."""
+    a, b = before, after
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    turned[0] = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
+    turned[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
+    turned[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
+    sine = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
+    # q and −q are one rotation: the shorter way
+    scale = 2.0 * math.atan2(sine, abs(w)) / sine if sine > 0.0 else 2.0
+    for i in range(3):
+        turned[i] *= math.copysign(scale, w)
+
+
+@compiled
+def complementary_filter(up: Array, turned: Array, force: Array, gain: float) -> None:
+    r"""One step of a complementary filter of the vertical, the explicit one of [Mahony2008] without bias estimation.
+
+    .. math:: \dot u = u \times (\omega + \tfrac{1}{\tau} \, f / |f| \times u)
+
+    Args:
+        up: Vertical in the frame of the sensor, a unit vector, which is brought up to date, (3,) [1].
+        turned: Rotation of the sensor by its gyroscope, as a vector in its frame, (3,) [rad].
+        force: Specific force by its accelerometer in the frame after it, (3,) [m/s²].
+        gain: 1 − exp(−period/τ) [1].
+    """
+    angle = math.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2)
+    # what stands still in the world turns backwards in the frame of the sensor
+    sine = math.sin(angle) / angle if angle > 0.0 else 1.0
+    cosine = (1.0 - math.cos(angle)) / (angle * angle) if angle > 0.0 else 0.5
+    x, y, z = up[0], up[1], up[2]
+    p, q, r = cross(x, y, z, turned)
+    s, t, u = cross(p, q, r, turned)
+    x, y, z = x + sine * p + cosine * s, y + sine * q + cosine * t, z + sine * r + cosine * u
+    size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if size > 0.0:
+        a, b, c = force[0] / size, force[1] / size, force[2] / size
+        along = a * x + b * y + c * z
+        x, y, z = x + gain * (a - along * x), y + gain * (b - along * y), z + gain * (c - along * z)
+    size = math.sqrt(x * x + y * y + z * z)
+    up[0], up[1], up[2] = x / size, y / size, z / size
+
+
+@compiled
+def settled_vertical(up: Array, force: Array, gyro: Array, time_constant_s: float) -> None:
+    """The vertical where the filter rests, for a constant force and a small bias of the gyroscope: into `up`, (3,)."""
+    size = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    x, y, z = force[0] / size, force[1] / size, force[2] / size
+    p, q, r = cross(x, y, z, gyro)
+    x, y, z = x + time_constant_s * p, y + time_constant_s * q, z + time_constant_s * r
+    size = math.sqrt(x * x + y * y + z * z)
+    up[0], up[1], up[2] = x / size, y / size, z / size
+
+
+@compiled
+def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, float]:
+    """Cross product of (x, y, z) with another vector."""
+    return y * other[2] - z * other[1], z * other[0] - x * other[2], x * other[1] - y * other[0]
 
 
 @compiled

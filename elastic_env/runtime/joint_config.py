@@ -36,7 +36,7 @@ class JointConfig(Model):
 
     @model_validator(mode="after")
     def _scenario_acts(self) -> Self:
-        acting = [name for name in WALKER_FIELDS if getattr(self.scenario, name) > 0.0]
+        acting = [name for name in WALKER_FIELDS if getattr(self.scenario, name)]
         if acting:
             raise ValueError(
                 f"scenario {self.scenario.name!r} sets {', '.join(acting)}, which only a walker knows; here "

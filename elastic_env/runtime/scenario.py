@@ -12,7 +12,7 @@ from typing import Any
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD
-from elastic_env.runtime.sensors import AttitudeSensor
+from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
 
 
 class Scenario(Model):
@@ -37,6 +37,9 @@ class Scenario(Model):
     """IMU on the link of the testbed."""
     pelvis_imu: AttitudeSensor = AttitudeSensor(rate_hz=500.0)
     """IMU in the pelvis of the walker, the same for roll and pitch."""
+    inertial: InertialSensor | None = None
+    """walker: IMU in the pelvis that computes its attitude; None for one that shows the true one with `pelvis_imu`'s
+    noise. Other errors of `pelvis_imu` are then those of the mounting."""
     gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0, description="walker: standard deviation of the gyroscope")
     force_noise_n: float = quantity("N", 0.0, ge=0, description="walker: standard deviation of the foot forces")
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
@@ -50,13 +53,23 @@ class Scenario(Model):
             self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.imu.bias_spread_rad,
             self.pelvis_imu.bias_spread_rad,
         )  # fmt: skip
-        return any(value > 0.0 for value in drawn)
+        return self.inertial is not None or any(value > 0.0 for value in drawn)
 
     @property
     def is_random(self) -> bool:
         """Whether episodes of the same motion differ: in what `draws_robots` says, or by noise."""
         noise = self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm
         return self.draws_robots or any((*noise, self.imu.is_random, self.pelvis_imu.is_random))
+
+    @property
+    def pelvis_noise_rad(self) -> float:
+        """Walker: standard deviation of the noise of roll and pitch, in an inertial IMU before its filter."""
+        return self.pelvis_imu.noise_rad if self.inertial is None else self.inertial.accelerometer_noise_rad
+
+    @property
+    def pelvis_gyro_noise_rad_s(self) -> float:
+        """Walker: standard deviation of the gyroscope's noise."""
+        return self.gyro_noise_rad_s if self.inertial is None else self.inertial.gyro_noise_rad_s
 
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
@@ -99,15 +112,16 @@ CHANGES: dict[str, ScenarioChange] = {
         "pelvis_imu": ground.pelvis_imu.replace(bias_spread_rad=_HOMING_ERROR_RAD),
         "delay_steps": 1,
     },
+    "imu": lambda _: {"inertial": InertialSensor(), "delay_steps": 1},
     "push": lambda _: {"push_n": 50.0},
     "slope": lambda _: {"slope_rad": math.radians(1.0)},
 }
 """Parameters that a change sets on its ground."""
 
 
-WALKER_ONLY = ("spread", "push", "slope")
+WALKER_ONLY = ("spread", "imu", "push", "slope")
 """Changes that only a robot that walks knows."""
-WALKER_FIELDS = ("stiffness_spread", "push_n", "slope_rad")
+WALKER_FIELDS = ("stiffness_spread", "inertial", "push_n", "slope_rad")
 """What they set."""
 
 

@@ -289,6 +289,7 @@ _WALKER = Environment(
         _ZMP,
         Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
         Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
+        Column("IMU", "imu_error_rms_rad", on_console=False, note="error of its attitude, roll and pitch together"),
         Column("early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"),
         Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
         Column("COM jump", "com_jump_mean_m", decimals=1),

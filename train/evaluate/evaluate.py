@@ -186,12 +186,15 @@ def _play_in(
     keeper = _FirstWorld(task, condition.environment.traced) if first == 0 else None
     is_scored = hasattr(policy, "link_estimate") and not condition.environment.is_real
     estimates = _Estimates(task, worlds) if is_scored else None
+    imu = _ImuError(task, worlds) if isinstance(task.assumed_model, WalkerModel) else None
     observation, info = env.reset(seed=condition.seed + first)
     records: list[dict[str, Any] | None] = [None] * worlds
     state, episode_start, step, reported = None, np.ones(worlds, dtype=np.bool_), 0, 0
     while any(record is None for record in records):
         if keeper is not None and records[0] is None:
             keeper.take(observation, info)
+        if imu is not None:
+            imu.take(observation, info)
         with _blamed(condition, step):
             action, state = policy.predict(observation, state=state, episode_start=episode_start, deterministic=True)
             if estimates is not None:
@@ -200,7 +203,8 @@ def _play_in(
         episode_start = np.zeros(worlds, dtype=np.bool_)
         for world in np.flatnonzero(terminated | truncated):
             if records[world] is None:
-                records[world] = _record(condition, first + int(world), info, int(world), estimates)
+                own = [part.metrics(int(world)) for part in (estimates, imu) if part is not None]
+                records[world] = _record(condition, first + int(world), info, int(world), own)
                 if world == 0 and keeper is not None:
                     keeper.take(observation, info)
         step += 1
@@ -234,7 +238,7 @@ def _blamed(condition: Condition, step: int) -> Iterator[None]:
 
 
 def _record(
-    condition: Condition, episode: int, info: dict[str, Any], world: int, estimates: "_Estimates | None"
+    condition: Condition, episode: int, info: dict[str, Any], world: int, further: list[dict[str, float]]
 ) -> dict[str, Any]:
     metrics = {name: values[world].item() for name, values in info["episode_metrics"].items()}
     member = condition.member
@@ -250,31 +254,57 @@ def _record(
         "seed": condition.seed + episode,
         "termination": str(info["termination"][world]),
         **metrics,
-        **(estimates.metrics(world) if estimates is not None else {}),
+        **{name: value for metrics in further for name, value in metrics.items()},
     }
+
+
+class _Rms:
+    """RMS over the scored steps of every world."""
+
+    def __init__(self, task: Any, worlds: int) -> None:
+        self._task, self._sum, self._count = task, np.zeros(worlds), np.zeros(worlds)
+
+    def take(self, squared: Array) -> None:
+        scored = self._task.masks(self._task.sample())["scored"]
+        self._sum += np.where(scored, squared, 0.0)
+        self._count += scored
+
+    def of(self, world: int) -> float:
+        count = self._count[world]
+        return float(np.sqrt(self._sum[world] / count)) if count else float("nan")
+
+
+class _ImuError:
+    """Roll and pitch by a walker's IMU, as old as they are shown, against the truth."""
+
+    def __init__(self, task: Any, worlds: int) -> None:
+        self._rms, self._attitude = _Rms(task, worlds), task.observation_table.group("imu_attitude")
+
+    def take(self, observation: Array, info: dict[str, Any]) -> None:
+        error = observation[:, self._attitude] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+        self._rms.take(np.square(error).sum(axis=1))
+
+    def metrics(self, world: int) -> dict[str, float]:
+        """RMS of the angle by which the shown vertical is off."""
+        return {"imu_error_rms_rad": self._rms.of(world)}
 
 
 class _Estimates:
     """A policy's estimate of the link angles against the truth, and on a walker what it makes of the local frame."""
 
     def __init__(self, task: Any, worlds: int) -> None:
-        self._task = task
-        self._sum, self._count = np.zeros(worlds), np.zeros(worlds)
+        self._rms = _Rms(task, worlds)
         self._changes = SupportChanges(task.assumed_model) if isinstance(task.assumed_model, WalkerModel) else None
 
     def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
-        scored = self._task.masks(self._task.sample())["scored"]
-        self._sum += np.where(scored, np.square(estimate - truth.q).mean(axis=1), 0.0)
-        self._count += scored
+        self._rms.take(np.square(estimate - truth.q).mean(axis=1))
         if self._changes is not None:
             self._changes.take(step, estimate, observation, truth)
 
     def metrics(self, world: int) -> dict[str, float]:
         """RMS over the scored steps, and the figures of the support changes."""
-        count = self._count[world]
-        rms = float(np.sqrt(self._sum[world] / count)) if count else float("nan")
         changes = self._changes.metrics(world) if self._changes is not None else {}
-        return {"link_estimate_error_rms_rad": rms, **changes}
+        return {"link_estimate_error_rms_rad": self._rms.of(world), **changes}
 
 
 class _FirstWorld:

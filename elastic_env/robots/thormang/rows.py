@@ -39,6 +39,7 @@ TRUTH = record_type(
     ("offset", REAL, NUM_JOINTS), ("command", REAL, NUM_JOINTS),  # a, and θ_cmd = q_ref + a [rad]
     ("command_rate", REAL),  # rms over the joints of the change of a [rad/s]
     ("pelvis", REAL, 3), ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
+    ("pelvis_velocity", REAL, 3),  # of its origin, where the IMU is, in the world [m/s]
     ("pelvis_rate", REAL, 3),  # in the frame of the pelvis [rad/s]
     ("roll", REAL), ("pitch", REAL), ("tilt", REAL),  # of yaw, pitch, roll; angle from the vertical [rad]
     ("ankles", REAL, (2, 3)),  # positions [m]
@@ -53,14 +54,19 @@ MEASURED = record_type(
     ("encoder", REAL, NUM_JOINTS), ("encoder_before", REAL, NUM_JOINTS),  # now and one control step ago [rad]
     ("imu_attitude", REAL, 2), ("imu_rate", REAL, 3),  # roll and pitch [rad], as pelvis_rate [rad/s]
     ("wrench", REAL, _FEET_WRENCH),  # as in the truth
+    # within an inertial IMU: vertical in its frame by its filter [1], rate by its gyroscope [rad/s]
+    ("imu_up", REAL, 3), ("imu_gyro", REAL, 3),
 )  # fmt: skip
-"""What the sensors show."""
+"""What the sensors show, and what one of them keeps."""
 
 NOISE = record_type(*((group.name, REAL, group.shape) for group in GROUPS if group.noise is not None))
 """Standard normal samples of a control step [1], or their standard deviations in the units of the signals."""
 
-BIAS = record_type(("encoder", REAL, NUM_JOINTS), ("imu_attitude", REAL, 2))
-"""Errors of homing and mounting, drawn per episode [rad]."""
+BIAS = record_type(
+    ("encoder", REAL, NUM_JOINTS), ("imu_attitude", REAL, 2),  # of homing and mounting [rad]
+    ("gyro", REAL, 3), ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
+)  # fmt: skip
+"""Errors that are drawn per episode."""
 
 SCORES = record_type(("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL))
 """Weighted terms of the reward."""
@@ -76,10 +82,14 @@ ROW_OF_PLAN = record_type(
 )  # fmt: skip
 """What a control step needs of the plan."""
 
+INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
+"""An inertial IMU; where none is fitted, the attitude comes with the errors that `QUALITY` has for it."""
+
 QUALITY = record_type(
     ("count_rad", REAL),  # of the encoders, 0 for none
     ("noise", NOISE),  # standard deviations
     ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL),
+    ("inertial", INERTIAL),
 )  # fmt: skip
 """Quality of the sensors: noise and constant errors."""
 

@@ -62,11 +62,11 @@ GROUPS = (
     _of("encoder_rate", "rad/s", "its change over the last control period, {part}", JOINTS, "measured"),
     _of(
         "imu_attitude", "rad", "{part} of the pelvis by its IMU", _TURNS, "measured",
-        noise=lambda scenario: scenario.pelvis_imu.noise_rad,
+        noise=lambda scenario: scenario.pelvis_noise_rad,
     ),
     _of(
         "imu_rate", "rad/s", "gyroscope of the pelvis about its {part}", _RATES, "measured",
-        noise=lambda scenario: scenario.gyro_noise_rad_s,
+        noise=lambda scenario: scenario.pelvis_gyro_noise_rad_s,
     ),
     SignalGroup(
         "wrench", _wrenches(), shape=(2, 2, 3),

@@ -7,8 +7,8 @@ then the same of the right leg (r_...); a name before a dot has one column per j
 |---|---|---|---|
 | 0 to 11 | `encoder_angle.<joint>` | rad | motor encoder, θ in whole counts |
 | 12 to 23 | `encoder_rate.<joint>` | rad/s | its change over the last control period |
-| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis |
-| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis |
+| 24, 25 | `imu_attitude.roll`, `.pitch` | rad | IMU in the pelvis; in the scenario `imu` by its own filter |
+| 26 to 28 | `imu_rate.x`, `.y`, `.z` | rad/s | its gyroscope, in the frame of the pelvis; in `imu` a period's mean |
 | 29 to 31 | `wrench.l_fx`, `.l_fy`, `.l_fz` | N | left ankle sensor: force of foot on leg, in the foot's frame |
 | 32 to 34 | `wrench.l_mx`, `.l_my`, `.l_mz` | N·m | moment about the ankle, likewise |
 | 35 to 40 | `wrench.r_fx` to `.r_mz` | N, N·m | right ankle sensor |
@@ -82,6 +82,7 @@ from elastic_env.robots.thormang.rows import (
     ADDRESSES,
     BIAS,
     CONSTANTS,
+    INERTIAL,
     NOISE,
     OBSERVED,
     QUALITY,
@@ -165,7 +166,7 @@ class WalkTask(Stateful):
         )
         self._constants = one(
             CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
-            quality=_quality(config.scenario, self._true_model.encoder_counts_per_turn),
+            quality=_quality(config.scenario, self._true_model.encoder_counts_per_turn, robot.gravity),
             rules=_rules(config, UNLOADED_SHARE * weight, least_n),
         )  # fmt: skip
         self._plan_rows = _plan_rows(self.plan, config)
@@ -200,6 +201,7 @@ class WalkTask(Stateful):
             self._draw_push(world, generator)
             self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
             truth["stiffness"][world] = self._place(simulation, world)
+            self._draw_imu(world, generator)
         simulation.refresh(worlds)
         if not self._is_compiled:
             compile_now(self._rehearse, simulation)
@@ -368,6 +370,14 @@ class WalkTask(Stateful):
         self._push_begin[world] = begin
         self._push_force[world] = self.config.scenario.push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
 
+    def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
+        """Errors of an inertial IMU, where one is fitted."""
+        sensor, bias = self.config.scenario.inertial, self._bias
+        if sensor is not None:
+            bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
+            bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
+            bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
+
     def _place(self, simulation: Simulation, world: int) -> Array:
         """Give a world its robot, at rest; its true K, (12,) [N·m/rad]."""
         scenario, draw = self.config.scenario, self._bank[self._draw[world]]
@@ -437,15 +447,19 @@ def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
     )  # fmt: skip
 
 
-def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:
+def _quality(scenario: Scenario, counts_per_turn: int | None, gravity_m_s2: float) -> Records:
     """Quality of the sensors in a scenario, one row of `QUALITY`."""
     imu, noise = scenario.pelvis_imu, np.zeros(1, NOISE)
     for group in GROUPS:
         if group.noise is not None:
             noise[group.name] = group.noise(scenario)
+    inertial = one(
+        INERTIAL, is_fitted=scenario.inertial is not None, gravity_m_s2=gravity_m_s2,
+        time_constant_s=1.0 if scenario.inertial is None else scenario.inertial.time_constant_s,
+    )  # fmt: skip
     return one(
         QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None), noise=noise,
-        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
+        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad, inertial=inertial,
     )  # fmt: skip
 
 
