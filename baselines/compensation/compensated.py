@@ -23,7 +23,7 @@ class Compensated:
             attribute `reads_rates = False`, which saves their estimate.
         compensator: Where the motor has to lead, and where the link is.
         ramp_s: Duration of the ramp.
-        corrects_policy: Whether a correction of the deflection also reaches the policy, by its `predict_corrected`, as
+        corrects_policy: Whether a correction of the deflection also reaches the policy, by its `predict_winding`, as
             one that winds springs needs it.
     """
 
@@ -80,7 +80,7 @@ class Compensated:
         call = inner_state, episode_start, deterministic
         shown = seen if observation.ndim > 1 else seen[0]
         if self._corrects_policy:
-            action, inner_state = self.policy.predict_corrected(shown, correction, *call)  # type: ignore[attr-defined]
+            action, inner_state = self.policy.predict_winding(shown, correction, *call)  # type: ignore[attr-defined]
         else:
             action, inner_state = self.policy.predict(shown, *call)
         action = np.atleast_2d(np.asarray(action, dtype=np.float64))

@@ -112,9 +112,9 @@ class WalkingController:
         self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Action, Any]:
         """Offsets of the twelve joints [rad], and new state."""
-        return self.predict_corrected(observation, None, state, episode_start, deterministic)
+        return self.predict_winding(observation, None, state, episode_start, deterministic)
 
-    def predict_corrected(
+    def predict_winding(
         self,
         observation: Array,
         correction: Array | None,
