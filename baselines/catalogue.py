@@ -17,7 +17,10 @@ from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
 from baselines.walking.controller import WalkingController
+from baselines.walking.foot_balance import FootBalance
+from baselines.walking.hip_torque import HipTorque
 from baselines.walking.posture import PostureFeedback
+from baselines.walking.stance_roll import StanceRoll
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
@@ -126,6 +129,15 @@ def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     return build
 
 
+def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
+    balance = FootBalance(model, options.foot_balance, options.ramp_s)
+    return StanceRoll(balance, model, options.stance_roll)
+
+
+def _talos(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
+    return HipTorque(_controller(env, model, options), model, options.hip_torque)
+
+
 COMPENSATED: Mapping[str, Builder] = {
     "input": _around_controller(GravityCompensator, "none"),
     "input_output": _around_controller(GravityCompensator, "taylor"),
@@ -163,6 +175,10 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "torque_sensor": NamedPolicy(_measured(TORQUE_SENSOR), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
     "hip_sensor": NamedPolicy(_measured(LINK_ENCODER, ("hip",)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
     "link_encoder": NamedPolicy(_measured(LINK_ENCODER), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "thormang": NamedPolicy(_thormang, ("stance_roll", "foot_balance", "ramp_s")),
+    "talos": NamedPolicy(
+        _talos, (*_ASSUMED, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
+    ),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
 """Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""

@@ -52,6 +52,8 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `adaptive_posture` | - | both: the strongest with the standard sensors |
     | `torque_sensor` | - | deflections by joint torque sensors, K⁻¹ τ_J |
     | `hip_sensor`, `link_encoder` | - | deflections by link encoders, at the hips or at all joints |
+    | `thormang` | - | what this robot's published controller does: hip roll in single support, feet by IMU and wrench |
+    | `talos` | - | the controller, its hip rolls led by their measured torque, as TALOS' published one does |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
     | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
     | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |
