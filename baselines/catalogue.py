@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
 from baselines.adaptation.online_stiffness import JointEstimator, LegEstimator, OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
@@ -67,6 +68,16 @@ def _around_zero(compensator: Compensating) -> Builder:
         return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
 
     return build
+
+
+def _friction(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    made = DynamicCompensator(model, options.output or "taylor", options.gravity, friction=True)
+    return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
+
+
+def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    build = _friction if options.observer.friction else _around_zero(DynamicCompensator)
+    return DisturbanceObserver(build(env, model, options), model, options.observer, options.ramp_s)
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
@@ -159,6 +170,10 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "uncompensated": NamedPolicy(_zero),
     "input": NamedPolicy(_around_zero(GravityCompensator), _COMPENSATOR),
     "dynamic": NamedPolicy(_around_zero(DynamicCompensator), _COMPENSATOR),
+    "friction": NamedPolicy(_friction, _COMPENSATOR),
+    "disturbance_observer": NamedPolicy(
+        _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
+    ),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
 """Policies of robots on a fixed base. There `uncompensated` has no controller to add and equals `zero`."""

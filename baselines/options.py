@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from baselines.adaptation.disturbance_observer import ObserverGains
 from baselines.adaptation.online_stiffness import AdaptationGains
 from baselines.compensation.compensators import OutputMethod
 from baselines.compensation.gravity_torque import GravityMethod
@@ -43,4 +44,6 @@ class PolicyOptions(Model):
     """Walker: gains of the stabiliser of `thormang`."""
     hip_torque: HipTorqueGains = HipTorqueGains()
     """Walker: filter, bound and rate limit of `talos`."""
+    observer: ObserverGains = ObserverGains()
+    """Testbed: filters and bound of `disturbance_observer`."""
     ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")

@@ -47,6 +47,8 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `input_output` | - | also Eq. 12: the controller sees the estimated links |
     | `input_wrench` | - | the estimate takes the measured foot wrenches instead of the planned load share |
     | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
+    | `friction` | `dynamic`, and the model's Coulomb friction fed forward | - |
+    | `disturbance_observer` | `friction`, and the torque that the link's IMU shows to be missing | - |
     | `adaptive` | - | `input_output` with the stiffness of each leg adapted online |
     | `posture` | - | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | - | both: the strongest with the standard sensors |
