@@ -104,7 +104,7 @@ def test_the_observer_finds_a_torque_of_known_size_in_the_stated_time() -> None:
 
     The link swings on its spring meanwhile, by as much as it gives way: what is not consistent rings in the estimate.
     """
-    gains, env = ObserverGains(time_constant_s=0.3, rate_filter_s=0.03, zero_s=0.0), made()
+    gains, env = ObserverGains(time_constant_s=0.3, rate_filter_s=0.03, zero_s=0.0, friction=False), made()
     torque = np.where(np.arange(500) < 100, 0.0, 6.0)
     policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
     for step, row in enumerate(rows_of_a_link(env, torque)):
@@ -128,7 +128,7 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
         simulation.bind("qfrc_applied")[:, address] = -6.0 if task._step[0] >= 200 else 0.0
 
     task.disturb = disturb
-    errors, states, _ = played(baselines.make("disturbance_observer", env), env)
+    errors, states, _ = played(baselines.make("disturbance_observer", env, observer=ObserverGains(friction=False)), env)
     uncompensated, _, _ = played(baselines.make("dynamic", env), env)
     assert uncompensated[-1, 0] == pytest.approx(6.0 / 1061.0, rel=0.02)
     assert abs(errors[-1, 0]) < 0.02 * uncompensated[-1, 0]
@@ -137,7 +137,7 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
 
 def test_the_estimate_is_bounded_and_does_not_wind_up() -> None:
     """Catches an integral behind the bound: it leaves the bound as soon as the torque does."""
-    gains, env = ObserverGains(limit_nm=2.0, zero_s=0.0), made()
+    gains, env = ObserverGains(limit_nm=2.0, zero_s=0.0, friction=False), made()
     torque = np.where(np.arange(400) < 200, 20.0, 0.0)
     policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
     for step, row in enumerate(rows_of_a_link(env, torque)):
@@ -145,6 +145,15 @@ def test_the_estimate_is_bounded_and_does_not_wind_up() -> None:
         found.append(policy.disturbance(state)[0, 0])
     assert max(found) == 2.0
     assert abs(found[-1]) < 0.3
+
+
+def test_at_rest_what_friction_can_hold_is_no_disturbance() -> None:
+    """Catches an observer that winds up against a link that sticks: of 6 N·m only what is beyond 5.4 counts."""
+    gains, env = ObserverGains(zero_s=0.0), made()
+    policy, state = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None
+    for step, row in enumerate(rows_of_a_link(env, np.full(100, FRICTION - 0.1))):
+        _, state = policy.predict(row, state, np.array([step == 0]))
+    assert abs(policy.disturbance(state)[0, 0]) < 1.0
 
 
 @pytest.mark.parametrize(("middle", "expected"), [(0.0, 1.7e-3), (0.5, 0.0)])

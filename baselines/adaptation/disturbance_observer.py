@@ -10,8 +10,9 @@ I q̈ is the change of the momentum over a control period. It needs q̇ alone, a
 Deflection and link angle, their rates and the friction pass one and the same further filter. What is behind it obeys
 the same equation, so that a motion without disturbance leaves nothing. The command leads by d̂/K more.
 
-d is what another K, another load and what is left of friction do; the friction of the model is taken as known. Where K
-and load are as assumed, d does not depend on the command, and there is no loop. For a K that is wrong by ΔK there is
+d is what another K, another load and what is left of friction do. In motion the friction of the model is taken as
+known. At rest it may be anything up to F: else the estimate winds up against a link that sticks. Where K and load are
+as assumed, d does not depend on the command, and there is no loop. For a K that is wrong by ΔK there is
 one, which is strongest at the resonance ω of link and spring. Its gain there is
 
 .. math:: \frac{1}{\omega T} \frac{K}{D \omega} \frac{\Delta K}{K}, \quad
@@ -150,8 +151,12 @@ class DisturbanceObserver:
         q, q_dot = smooth("smooth_q", theta - deflection)
         known, _ = smooth("smooth_friction", friction)
         passed = joint_torque(delta, delta_dot, model.stiffness, model.damping, model.backlash)
-        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was["rate"]) / self._dt) + known
-        missing = np.where(is_zeroing, 0.0, passed - needed)
+        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was["rate"]) / self._dt)
+        # at rest dry friction takes any value up to F: only what is beyond is a disturbance
+        left = passed - needed - was["disturbance"]
+        stands = self._view.motion(rows).q_dot == 0.0
+        rubs = np.where(stands, np.clip(left, -self._coulomb, self._coulomb), known)
+        missing = np.where(is_zeroing, 0.0, passed - needed - rubs)
         disturbance = was["disturbance"] + self._follows * (missing - was["disturbance"])
         disturbance = np.clip(disturbance, -gains.limit_nm, gains.limit_nm)
         return np.hstack([steps, offset, imu, deflection, friction, delta, q, known, q_dot, disturbance])
