@@ -53,7 +53,7 @@ def test_at_constant_speed_the_command_leads_by_friction_over_k(rate: float) -> 
     offsets = []
     for knows in (True, False):
         compensator = DynamicCompensator(model, friction=knows)
-        q, dot = np.zeros((1, 1)), np.full((1, 1), rate)
+        q, dot, offset = np.zeros((1, 1)), np.full((1, 1), rate), np.zeros((1, 1))
         memory = compensator.begin(Motion(q, dot, 0.0 * dot))
         for _ in range(500):
             q = q + rate * PERIOD_S
@@ -105,7 +105,7 @@ def test_the_observer_finds_a_torque_of_known_size_in_the_stated_time() -> None:
     The link swings on its spring meanwhile, by as much as it gives way: what is not consistent rings in the estimate.
     """
     gains, env = ObserverGains(time_constant_s=0.3, rate_filter_s=0.03, zero_s=0.0, friction=False), made()
-    torque = np.where(np.arange(500) < 100, 0.0, 6.0)
+    torque, action = np.where(np.arange(500) < 100, 0.0, 6.0), np.zeros((1, 1))
     policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
     for step, row in enumerate(rows_of_a_link(env, torque)):
         action, state = policy.predict(row, state, np.array([step == 0]))
@@ -176,7 +176,7 @@ def test_the_observer_is_stable_in_every_scenario(scenario: str) -> None:
 
 def test_the_link_imu_is_a_sensor() -> None:
     """Catches other columns than `observe_link` has, and an observation that changes where nobody asks."""
-    tables = [made(**given).unwrapped.task.observation_table.names for given in ({}, {"sensors": []})]
+    tables = [made(sensors=given).unwrapped.task.observation_table.names for given in (["link_imu"], [])]
     asked = made(sensors=[], observe_link=True).unwrapped.task.observation_table.names
     assert list(tables[0]) == list(asked) == [*tables[1], "link_angle_imu"]
     with_both = made(sensors=["joint_torque", "link_imu"], observe_link=True).unwrapped.task.observation_table.names
