@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
 from baselines.adaptation.estimators import EncoderEstimator, LegEstimator
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
@@ -18,7 +19,10 @@ from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Policy, Zero
 from baselines.options import PolicyOptions
 from baselines.walking.controller import WalkingController, WalkingGains
+from baselines.walking.foot_balance import FootBalance
+from baselines.walking.hip_torque import HipTorque
 from baselines.walking.posture import PostureFeedback
+from baselines.walking.stance_roll import StanceRoll
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
@@ -65,6 +69,16 @@ def _around_zero(compensator: Compensating) -> Builder:
         return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
 
     return build
+
+
+def _friction(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    made = DynamicCompensator(model, options.output or "taylor", options.gravity, friction=True)
+    return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
+
+
+def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
+    build = _friction if options.observer.friction else _around_zero(DynamicCompensator)
+    return DisturbanceObserver(build(env, model, options), model, options.observer, options.ramp_s)
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
@@ -136,6 +150,15 @@ def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     return build
 
 
+def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
+    balance = FootBalance(model, options.foot_balance, options.ramp_s)
+    return StanceRoll(balance, model, options.stance_roll)
+
+
+def _talos(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
+    return HipTorque(_controller(env, model, options), model, options.hip_torque)
+
+
 _WEIGHING = WalkingGains(weight_filter_s=1.0)
 
 COMPENSATED: Mapping[str, Builder] = {
@@ -159,6 +182,10 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "uncompensated": NamedPolicy(_zero),
     "input": NamedPolicy(_around_zero(GravityCompensator), _COMPENSATOR),
     "dynamic": NamedPolicy(_around_zero(DynamicCompensator), _COMPENSATOR),
+    "friction": NamedPolicy(_friction, _COMPENSATOR),
+    "disturbance_observer": NamedPolicy(
+        _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
+    ),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
 """Policies of robots on a fixed base. There `uncompensated` has no controller to add and equals `zero`."""
@@ -181,6 +208,10 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
         _weighing(_measured(LINK_ENCODER, ("hip",))), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
     ),
     "link_encoder": NamedPolicy(_weighing(_measured(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "thormang": NamedPolicy(_thormang, ("stance_roll", "foot_balance", "ramp_s")),
+    "talos": NamedPolicy(
+        _talos, (*_ASSUMED, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
+    ),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
 """Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""

@@ -2,11 +2,15 @@
 
 from typing import Any
 
+from baselines.adaptation.disturbance_observer import ObserverGains
 from baselines.adaptation.online_stiffness import AdaptationGains
 from baselines.compensation.compensators import OutputMethod
 from baselines.compensation.gravity_torque import GravityMethod
 from baselines.walking.controller import WalkingGains
+from baselines.walking.foot_balance import FootBalanceGains
+from baselines.walking.hip_torque import HipTorqueGains
 from baselines.walking.posture import PostureGains
+from baselines.walking.stance_roll import StanceRollGains
 from elastic_env.core.config import Model, quantity
 from elastic_env.motion.trajectory import STAND_S
 
@@ -34,4 +38,12 @@ class PolicyOptions(Model):
     """Walker: how fast the stiffness is adapted."""
     posture: PostureGains = PostureGains()
     """Walker: gains of the posture feedback."""
+    stance_roll: StanceRollGains = StanceRollGains()
+    """Walker: hip roll feedforward of `thormang`."""
+    foot_balance: FootBalanceGains = FootBalanceGains()
+    """Walker: gains of the stabiliser of `thormang`."""
+    hip_torque: HipTorqueGains = HipTorqueGains()
+    """Walker: filter, bound and rate limit of `talos`."""
+    observer: ObserverGains = ObserverGains()
+    """Testbed: filters and bound of `disturbance_observer`."""
     ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")

@@ -47,11 +47,15 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `input_output` | - | also Eq. 12: the controller sees the estimated links |
     | `input_wrench` | - | the estimate takes the measured foot wrenches instead of the planned load share |
     | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
+    | `friction` | `dynamic`, and the model's Coulomb friction fed forward | - |
+    | `disturbance_observer` | `friction`, and the torque that the link's IMU shows to be missing | - |
     | `adaptive` | - | `input_output` with the stiffness of each leg adapted online |
     | `posture` | - | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | - | both: the strongest with the standard sensors |
     | `torque_sensor` | - | deflections by joint torque sensors, K⁻¹ τ_J |
     | `hip_sensor`, `link_encoder` | - | deflections by link encoders, at the hips or at all joints |
+    | `thormang` | - | what this robot's published controller does: hip roll in single support, feet by IMU and wrench |
+    | `talos` | - | the controller, its hip rolls led by their measured torque, as TALOS' published one does |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
     | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
     | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |

@@ -189,8 +189,6 @@ class DynamicCompensator:
     """
 
     modelled: float | Array = 1.0
-    presliding_rad = 1e-3
-    """Displacement over which the friction turns round (Dahl's model) [rad]."""
 
     def __init__(
         self,
@@ -236,7 +234,7 @@ class DynamicCompensator:
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
         """See `Compensator`."""
         old_deflection, old_rate, old_windup, old_friction = np.split(memory, 4, axis=-1)
-        friction = self._friction(old_friction, motion.q_dot * self._dt)
+        friction = presliding_friction(old_friction, motion.q_dot * self._dt, self._coulomb)
         torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot)
         torque = torque + self._viscous * motion.q_dot + friction
         settled = static_deflection(torque, self._K, self._backlash)
@@ -264,11 +262,6 @@ class DynamicCompensator:
         """See `Compensator`."""
         return self._static.link_rate(theta, theta_dot)
 
-    def _friction(self, friction: Array, displacement: Array) -> Array:
-        """Coulomb friction with presliding: it turns round over a displacement, and stays at rest [Dahl1968]."""
-        full = self._coulomb * np.sign(displacement)
-        return full + (friction - full) * np.exp(-np.abs(displacement) / self.presliding_rad)
-
     def _servo_error(self, effort: Array, windup: Array) -> tuple[Array, Array]:
         """Error e [rad] with k_p e + k_i ∫e = effort [N·m], and ∫e [rad·s]."""
         has_integrator = self._ki > 0.0
@@ -276,6 +269,24 @@ class DynamicCompensator:
         settled = _first_order(windup, effort / ki, self._kp / ki, self._dt)
         error = np.where(has_integrator, effort - ki * settled, effort) / self._kp
         return error, np.where(has_integrator, settled, 0.0)
+
+
+PRESLIDING_RAD = 1e-3
+"""Displacement over which Coulomb friction turns round [rad]."""
+
+
+def presliding_friction(friction: Array, displacement: Array, coulomb: Array) -> Array:
+    r"""Coulomb friction with presliding: it turns round over a displacement, and stays at rest [Dahl1968].
+
+    .. math:: f_{k+1} = F s + (f_k - F s) e^{-|\Delta q| / x_0}, \quad s = \mathrm{sign}(\Delta q)
+
+    Args:
+        friction: f, that holds the link back, before the displacement, (..., n) [N·m].
+        displacement: Δq, (..., n) [rad].
+        coulomb: F, (n,) [N·m].
+    """
+    full = coulomb * np.sign(displacement)
+    return full + (friction - full) * np.exp(-np.abs(displacement) / PRESLIDING_RAD)
 
 
 def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:

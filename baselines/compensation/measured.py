@@ -16,10 +16,27 @@ import numpy as np
 
 from baselines.compensation.compensators import Compensator, Motion
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, SignalTable
 from elastic_env.runtime.robot_model import RobotModel
 
 TORQUE_SENSOR, LINK_ENCODER = "joint_torque", "link_encoder"
+
+
+def require_sensor(table: SignalTable, sensor: str, group: str | None = None) -> None:
+    """Refuse an observation without a sensor.
+
+    Args:
+        table: The observation.
+        sensor: Name that `gymnasium.make(..., sensors=[...])` has for it.
+        group: Name of its columns; None for the same.
+
+    Raises:
+        ConfigurationError: It does not have it.
+    """
+    if (group or sensor) not in {name.split(".")[0] for name in table.names}:
+        raise ConfigurationError(
+            f"this policy reads {sensor}, which the environment does not have; make it with sensors=[{sensor!r}]"
+        )
 
 
 class DeflectionSensors:
@@ -40,10 +57,7 @@ class DeflectionSensors:
 
     def __init__(self, model: RobotModel, sensor: str, joints: tuple[str, ...] = ("",)) -> None:
         table = model.observation_table
-        if sensor not in {name.split(".")[0] for name in table.names}:
-            raise ConfigurationError(
-                f"this policy reads {sensor}, which the environment does not have; make it with sensors=[{sensor!r}]"
-            )
+        require_sensor(table, sensor)
         self._stiffness, self._is_torque = model.stiffness, sensor == TORQUE_SENSOR
         self._columns, self._encoder = table.group(sensor), table.group("encoder_angle")
         self.has: BoolArray = np.array([any(part in name for part in joints) for name in model.joint_names])

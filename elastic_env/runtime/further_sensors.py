@@ -6,6 +6,8 @@
 | `joint_torque` | a joint each | N·m | torque of spring and damper on the link | noise 0.2, offset up to 0.5 |
 | `accelerometer` | x, y, z | m/s² | specific force at the IMU, acceleration minus gravity | noise 0.0112 |
 
+`link_imu` of a fixed robot of one joint is declared in `elastic_env.runtime.joint_task`.
+
 The noise of the accelerometer is that of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4, calib), at half the
 control rate of 250 Hz. That of the torque sensor is an assumption: 0.2 and 0.5 % of 100 N·m. It is drawn anew every
 control step, the offset every episode.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
 from elastic_env.core.state import Stateful
@@ -32,6 +33,8 @@ ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
+LINK_IMU_SENSOR = "link_imu"
+"""Name by which `sensors=[...]` asks for it, on a robot of one joint; its errors are those of the scenario's IMU."""
 
 NOISE = np.dtype([("imu", np.float64)])
 """A sample of noise [1]."""
@@ -206,7 +209,10 @@ class JointTask(Stateful):
         config: Reference, scenario, sensors, rewards, periods.
         plant: What moves.
         num_worlds: How many.
-        observe_imu: Whether the IMU of the only link is observed.
+        observe_imu: Whether the IMU of the only link is observed, if no sensor of the configuration asks for it.
+
+    Raises:
+        ConfigurationError: An unknown sensor, or the IMU of the link on a robot of several joints.
     """
 
     STATE = (
@@ -220,10 +226,17 @@ class JointTask(Stateful):
         self.config, self.name, self.model, self.num_worlds = config, plant.name, plant.model, num_worlds
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         joints, n = plant.joint_names, len(plant.joint_names)
+        observe_imu = observe_imu or LINK_IMU_SENSOR in config.sensors
+        if observe_imu and n > 1:
+            raise ConfigurationError(
+                f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has {n}; "
+                "choose link_encoder to observe the links of several"
+            )
         self._plant, self._joints, self._observes_imu = plant, joints, observe_imu
         self.metrics: Sequence[Metric] = METRICS_OF_ONE if n == 1 else METRICS_OF_SEVERAL
+        others = [sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR]
         self._sensors = FurtherSensors(
-            config.sensors, dict.fromkeys(joints), config.scenario, plant.true.encoder_counts_per_turn, num_worlds
+            others, dict.fromkeys(joints), config.scenario, plant.true.encoder_counts_per_turn, num_worlds
         )
         self.action_table = action_table(joints)
         observed = [*observation_signals(joints), *([LINK_IMU] if observe_imu else []), *self._sensors.signals]

@@ -41,8 +41,8 @@ def configure_testbed(
         observe_link: Whether the link's IMU is part of the observation.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
-        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer"; see
-            `elastic_env.runtime.further_sensors`.
+        sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer", see
+            `elastic_env.runtime.further_sensors`, and "link_imu", which is the same as `observe_link`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.

@@ -10,7 +10,7 @@ Observation of one world (float64):
 | 3 | `reference_rate` | rad/s | its rate |
 | 4 | `reference_acceleration` | rad/s² | its acceleration |
 | 5 | `last_command` | rad | θ_cmd of the last control period |
-| 6 | `link_angle_imu` | rad | IMU on the link; only with `observe_link=True` |
+| 6 | `link_angle_imu` | rad | IMU on the link; only with `observe_link=True` or `sensors=["link_imu"]` |
 
 Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], within ±0.3.
 

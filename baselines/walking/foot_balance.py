@@ -1,0 +1,136 @@
+r"""Balance by moving the feet: the published stabiliser of THORMANG3, in the place of the walking controller.
+
+The planned poses of the feet in the pelvis are adjusted, and inverse kinematics give the joint angles:
+
+==============  =======================================================================================
+both feet turn  :math:`u = k_\varphi \hat\varphi + 0.1 \, k_\omega \hat\omega` about x and y: against the pelvis' tilt φ
+each foot z     :math:`(R_y(u_y) R_x(u_x) r)_z`, r its place from the middle of the feet: they turn as one
+each foot gives :math:`k_f (f - f_{ref})` along x, y, z and :math:`k_m m` about x and y
+==============  =======================================================================================
+
+f and m are force and moment of the foot on its leg: a foot that carries too much rises. The force that is wanted has
+the planned load share, and m a of the planned center of mass. Every measurement passes a first-order low-pass,
+α = 2πfT/(1 + 2πfT). An adjustment is bounded. The center of mass is not fed back, and motors are taken for links.
+
+Source: thor-mang/ROBOTIS-THORMANG-MPC, a fork of ROBOTIS-GIT/ROBOTIS-THORMANG-MPC, has the method:
+thormang3_balance_control/src/thormang3_balance_control.cpp (adjustments, bounds, the factor 0.1) and
+thormang3_walking_module/src/thormang3_online_walking.cpp (forces wanted). Gains and cut-off frequencies are those of
+thor-mang/ROBOTIS-THORMANG-OPC, thormang3_demo/config/balance_param.yaml. Its derivative gains are zero and left out.
+Its shift of the center of mass, which was set by hand for that robot, is left out too.
+
+Other than published: 250 Hz instead of 125 Hz. In double support horizontal forces follow the load share, not halves. A
+foot out of reach comes as near as the leg allows. The joint angles have no further feedback.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from baselines.compensation.policy import Action, ObservationView, taken_up
+from baselines.compensation.startup import Ramp
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.contact_force import shares
+from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt
+from elastic_env.motion.trajectory import STAND_S
+from elastic_env.motion.walk_plan import derivatives
+from elastic_env.runtime.robot_model import WalkerModel
+
+_REACH = 0.999
+"""Share of the straight leg's length to which a foot may go."""
+
+
+class FootBalanceGains(Model):
+    """Gains of the balance by the feet; the defaults are the published values."""
+
+    gyro_s: float = quantity("s", 0.05, ge=0, description="turn of the feet per rate of the tilt, 0.1 times 0.5")
+    attitude: float = quantity("1", 1.0, ge=0, description="turn of the feet per tilt")
+    force_horizontal: float = quantity("m/N", 0.125e-3, ge=0, description="shift of a foot per excess force, x and y")
+    force_vertical: float = quantity("m/N", 0.015e-3, ge=0, description="lift of a foot per excess force")
+    moment: float = quantity("rad/(N·m)", 0.001, ge=0, description="turn of a foot per moment on it")
+    imu_cutoff_hz: float = quantity("Hz", 40.0, gt=0, description="cut-off frequency of attitude and gyroscope")
+    wrench_cutoff_hz: float = quantity("Hz", 30.0, gt=0, description="cut-off frequency of forces and moments")
+    shift_limit_m: float = quantity("m", 0.05, gt=0, description="largest shift of a foot along an axis")
+    turn_limit_rad: float = quantity("rad", np.deg2rad(15.0), gt=0, description="largest turn of a foot about an axis")
+
+
+class FootBalance:
+    """Commands a walker around its plan by adjusting the feet, see the module.
+
+    Memory per world: steps, filtered roll and pitch, their rates, and the wrenches of both feet.
+
+    Args:
+        model: Assumed walker.
+        gains: Gains.
+        ramp_s: Time in which the feedback grows from zero [s].
+    """
+
+    def __init__(self, model: WalkerModel, gains: FootBalanceGains | None = None, ramp_s: float = STAND_S) -> None:
+        self._gains, self._biped, self._plan = gains or FootBalanceGains(), model.biped, model.plan
+        table, self._dt = model.observation_table, model.control_period_s
+        self._view, self._ramp = ObservationView(table, self._dt), Ramp(model, ramp_s)
+        self._attitude, self._rate = table.group("imu_attitude"), table.columns("imu_rate.x", "imu_rate.y")
+        self._wrench, self._clock = table.group("wrench"), table.group("clock")
+        acceleration, _ = derivatives(self._plan.com_dot, self._dt)
+        wanted = np.hstack([acceleration / self._biped.gravity, np.ones((len(acceleration), 1))])
+        self._wanted = self._biped.weight * shares(self._plan.share)[..., None] * wanted[:, None]  # (T, 2, 3)
+
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,  # noqa: ARG002  the interface's
+    ) -> tuple[Action, Any]:
+        """Offsets of the twelve joints [rad], and new state."""
+        rows, gains = self._view.rows(observation), self._gains
+        imu, wrench = np.hstack([rows[:, self._attitude], rows[:, self._rate]]), rows[:, self._wrench]
+        memory, _ = taken_up(
+            state, episode_start, rows, self._view, lambda: np.hstack([np.zeros((len(rows), 1)), imu, wrench])
+        )
+        steps, old_imu, old_wrench = np.split(memory, [1, 5], axis=1)
+        steps = steps + 1.0
+        imu = old_imu + self._share(gains.imu_cutoff_hz) * (imu - old_imu)
+        wrench = old_wrench + self._share(gains.wrench_cutoff_hz) * (wrench - old_wrench)
+        q_ref = self._view.motion(rows).q
+        shift, turn = self._adjustments(rows, imu, wrench)
+        action = self._ramp.share(steps) * (self._moved(q_ref, shift, turn) - q_ref)
+        kept = np.hstack([steps, imu, wrench])
+        return action.astype(np.float32).reshape((*observation.shape[:-1], 12)), (kept, None)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002  the interface's
+        """The encoder angles, (..., 12) [rad]: motors are taken for links."""
+        rows = self._view.rows(observation)
+        return self._view.theta(rows).reshape((*observation.shape[:-1], -1))
+
+    def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> tuple[Array, Array]:
+        """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y, (num_worlds, 2, 2) [rad]."""
+        gains = self._gains
+        row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
+        force, moment = np.moveaxis(wrench.reshape(-1, 2, 2, 3), 2, 0)
+        together = gains.attitude * imu[:, :2] + gains.gyro_s * imu[:, 2:]
+        gain = np.array([gains.force_horizontal, gains.force_horizontal, gains.force_vertical])
+        shift = gain * (force - self._wanted[row])
+        ankles = self._plan.ankles[row, :, :2]
+        from_middle = ankles - ankles.mean(axis=1, keepdims=True)
+        shift[..., 2] += np.einsum("wi,wfi->wf", rotation_of_tilt(together)[:, 2, :2], from_middle)
+        turn = together[:, None] + gains.moment * moment[..., :2]
+        return (
+            np.clip(shift, -gains.shift_limit_m, gains.shift_limit_m),
+            np.clip(turn, -gains.turn_limit_rad, gains.turn_limit_rad),
+        )
+
+    def _moved(self, q: Array, shift: Array, turn: Array) -> Array:
+        """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12) [rad]."""
+        leg, up = self._biped.leg, self._biped.ankle_height
+        position, R = foot_pose(leg, q.reshape(-1, 2, 6))
+        turned = rotation_of_tilt(turn) @ R
+        ankle = position + shift + up * (turned[..., 2] - R[..., 2])
+        distance = np.linalg.norm(ankle, axis=-1, keepdims=True)
+        ankle *= np.minimum(1.0, _REACH * leg.reach / distance)
+        return leg_angles(leg, ankle, turned).reshape(q.shape)
+
+    def _share(self, cutoff_hz: float) -> float:
+        """Share of a step that the low-pass makes in one period."""
+        x = 2.0 * np.pi * cutoff_hz * self._dt
+        return float(x / (1.0 + x))

@@ -1,0 +1,97 @@
+r"""Hip roll by its measured torque: the published compensation of flexible hips of TALOS.
+
+The measured torque of each hip roll passes a first-order low-pass, is divided by K, bounded, limited in its rate, and
+added to the command:
+
+.. math:: \Delta = \mathrm{rate}\big(\mathrm{clip}(\bar\tau_J / K, \pm\Delta_{max}), \pm\dot\Delta_{max}\big), \quad
+          \bar\tau_k = \alpha \bar\tau_{k-1} + (1 - \alpha) \tau_k, \quad \alpha = e^{-2 \pi f T}
+
+In double support the value before the rate limit is zero, as where the published entity has its input for the phase
+connected. The joint torque is positive along q, so the motor leads by the deflection that it stands for.
+
+The published entity reads the joint torque sensors of TALOS, and divides by 973.2 N·m/rad, the flexibility that was
+measured on that robot. Ours reads the sensor `joint_torque`, and divides by the K that is assumed of this robot.
+
+Source: loco-3d/sot-talos-balance, src/hip-flexibility-compensation.cpp (method); src/dynamic_graph/sot_talos_balance/
+talos/hip_flexibility_compensation_conf.py (1 Hz, 0.01 rad, 0.003 rad/s); create_entities_utils.py (torque sensors).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
+from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from elastic_env.runtime.robot_model import WalkerModel
+
+_HIP_ROLLS = [1, 7]  # of twelve joints, left and right
+
+
+class HipTorqueGains(Model):
+    """Hip roll by its measured torque; the defaults are the published values."""
+
+    cutoff_hz: float = quantity("Hz", 1.0, gt=0, description="cut-off frequency of the torque's low-pass")
+    limit_rad: float = quantity("rad", 0.01, gt=0, description="largest offset")
+    rate_rad_s: float = quantity("rad/s", 0.003, gt=0, description="largest rate of the offset")
+    in_double_support: bool = False
+    """Whether it also acts in double support, as where the published entity has no phase connected."""
+
+
+def filtered(before: Array, value: Array, cutoff_hz: float, period_s: float) -> Array:
+    """A first-order low-pass after one more sample, elementwise."""
+    decay = np.exp(-2.0 * np.pi * cutoff_hz * period_s)
+    return decay * before + (1.0 - decay) * value
+
+
+def limited_in_rate(before: Array, value: Array, rate: float, period_s: float) -> Array:
+    """The value, or as near to it as a rate [1/s] allows after one period, elementwise."""
+    return before + np.clip(value - before, -rate * period_s, rate * period_s)
+
+
+class HipTorque:
+    """Any policy of a walker with its hip rolls led by their measured torque, see the module.
+
+    Memory per world: filtered torques and offsets of the two hip rolls.
+
+    Args:
+        policy: What commands the robot.
+        model: Assumed walker, whose observation has the joint torque sensors.
+        gains: Filter, bound and rate limit.
+
+    Raises:
+        ConfigurationError: The observation does not have the sensors.
+    """
+
+    def __init__(self, policy: Policy, model: WalkerModel, gains: HipTorqueGains | None = None) -> None:
+        self._policy, self._gains = policy, gains or HipTorqueGains()
+        table, self._dt = model.observation_table, model.control_period_s
+        require_sensor(table, TORQUE_SENSOR)
+        self._view, self._clock = ObservationView(table, self._dt), table.group("clock")
+        self._torque = table.group(TORQUE_SENSOR)
+        self._stiffness = model.stiffness[_HIP_ROLLS]
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Action and new state."""
+        rows, gains = self._view.rows(observation), self._gains
+        measured = rows[:, self._torque][:, _HIP_ROLLS]
+        memory, inner = taken_up(
+            state, episode_start, rows, self._view, lambda: np.hstack([measured, np.zeros_like(measured)])
+        )
+        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
+        torque = filtered(memory[:, :2], measured, gains.cutoff_hz, self._dt)
+        wanted = np.clip(torque / self._stiffness, -gains.limit_rad, gains.limit_rad)
+        if not gains.in_double_support:
+            swing = rows[:, self._clock][:, [1]]
+            wanted = np.where((swing > 0.0) & (swing < 1.0), wanted, 0.0)
+        offset = limited_in_rate(memory[:, 2:], wanted, gains.rate_rad_s, self._dt)
+        total = np.array(action, dtype=np.float64)
+        total[..., _HIP_ROLLS] += offset.reshape((*total.shape[:-1], 2))
+        return total.astype(np.float32), (np.hstack([torque, offset]), inner)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angles that the policy saw, (..., 12) [rad]."""
+        return self._policy.link_estimate(observation, state[1])  # pyright: ignore[reportAttributeAccessIssue]
