@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import train.experiments.compare
+from baselines.catalogue import BEST_ON_THE_WALKER
 from baselines.residual.residual import ResidualDescription, read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
@@ -178,12 +179,14 @@ def test_a_pattern_stands_for_all_training_seeds_in_natural_order_with_their_bas
     (Path("run") / "seed_0.txt").write_text("no folder")
     name = f"residual:{Path.cwd()}/run/seed_*/last" if absolute else FAMILY.name
     found = expand([PolicySpec(name="zero"), FAMILY.replace(name=name)])
-    assert [entrant.policy.title for entrant in found] == ["zero", "input_output", "learned", "learned", "learned"]
+    titles = [entrant.policy.title for entrant in found]
+    assert titles == ["zero", "input_output", BEST_ON_THE_WALKER, "learned", "learned", "learned"]
     members = [entrant.member for entrant in found if entrant.member is not None]
     assert [member.training_seed for member in members] == [1, 2, 10]
-    assert {member.base for member in members} == {"input_output"}
-    assert [entrant.policy.name for entrant in found][2:] == [f"residual:{member.folder}" for member in members]
-    assert len(expand([FAMILY.replace(name=name)], with_bases=False)) == 3
+    assert {(member.base, member.rival) for member in members} == {("input_output", BEST_ON_THE_WALKER)}
+    assert [entrant.policy.name for entrant in found][3:] == [f"residual:{member.folder}" for member in members]
+    alone = expand([FAMILY.replace(name=name)], with_bases=False)
+    assert [entrant.member.rival for entrant in alone if entrant.member] == [None] * 3
 
 
 def test_a_base_is_the_policy_with_the_same_options() -> None:
@@ -194,12 +197,29 @@ def test_a_base_is_the_policy_with_the_same_options() -> None:
         PolicySpec(name="input_output"),
         PolicySpec(name="input_output", label="weak", options={"stiffness_scale": 0.9}),
     )
-    assert [e.policy for e in expand([residual, same])][1:] == [same]
-    assert expand([residual, same])[0].member == Member(folder="one", training_seed=1, base="weak")
+    found = expand([residual, same])
+    assert (found[0].policy.name, found[0].policy.options) == (BEST_ON_THE_WALKER, same.options)
+    assert [e.policy for e in found][2:] == [same]
+    assert found[1].member == Member(folder="one", training_seed=1, base="weak", rival=BEST_ON_THE_WALKER)
     added = expand([other, residual])[1].policy
     assert (added.title, added.options) == ("input_output (base of residual:one)", same.options)
-    given_anew = expand([residual.replace(options={"stiffness_scale": 0.5})])[0].policy
-    assert given_anew.options == {"stiffness_scale": 0.5}
+    given_anew = expand([residual.replace(options={"stiffness_scale": 0.5})])
+    assert [e.policy.options for e in given_anew] == [{"stiffness_scale": 0.5}] * 3
+
+
+def test_the_best_policy_without_learning_is_the_one_that_the_user_names() -> None:
+    """Catches a rival that plays twice, one that assumes another stiffness, and a base that is its own rival."""
+    describe(Path("one"), 1)
+    residual = PolicySpec(name="residual:one")
+    tuned = PolicySpec(name=str(BEST_ON_THE_WALKER), label="tuned", options={"ramp_s": 2.0})
+    found = expand([residual, tuned])
+    assert [e.policy.title for e in found] == ["input_output", "residual:one", "tuned"]
+    assert found[1].member == Member(folder="one", training_seed=1, base="input_output", rival="tuned")
+    wrong = tuned.replace(label=BEST_ON_THE_WALKER, options={"stiffness_scale": 0.9})
+    added = expand([wrong, residual])[2].policy
+    assert (added.title, added.options) == (f"{BEST_ON_THE_WALKER} (best analytic)", {})
+    describe(Path("two"), 1, base=BEST_ON_THE_WALKER)
+    assert [e.member.rival for e in expand([PolicySpec(name="residual:two")]) if e.member] == [None]
 
 
 def test_shipped_policies_are_a_family_wherever_one_works() -> None:
@@ -214,7 +234,7 @@ def test_a_residual_that_is_called_like_its_base_is_not_taken_for_it() -> None:
     """Catches both under one title, whose episodes would then be averaged together."""
     describe(Path("one"), 1)
     titles = [entrant.policy.title for entrant in expand([PolicySpec(name="residual:one", label="input_output")])]
-    assert titles == ["input_output (base of input_output)", "input_output"]
+    assert titles == ["input_output (base of input_output)", BEST_ON_THE_WALKER, "input_output"]
 
 
 @pytest.mark.parametrize(
@@ -344,6 +364,34 @@ def test_change_of_a_family_is_paired_per_training_seed() -> None:
     against = only(rows, "other")
     assert (against.base, against.is_family, against.relative) == ("base", False, Estimate(0.0))
     assert "no training seeds" in against.sentence
+
+
+def test_a_residual_is_compared_with_its_base_and_with_the_best_policy_without_learning() -> None:
+    """Catches a claim against the weaker of both alone, both under one heading, and the wrong one called its base."""
+    base, best = cell("base", {"all": [4.0, 4.0]}, "soft"), cell("best", {"all": [1.0, 1.0]}, "soft")
+    learned = [
+        Evaluation(e.condition.replace(member=e.condition.member.replace(rival="best")), e.episodes, e.trace)
+        for e in family([[2.0, 2.0]] * 5) if e.condition.member is not None
+    ]  # fmt: skip
+    evaluations = [base, best, *learned]
+    rows = [row for row in changes(evaluations) if row.policy == "learned" and row.column.metric == METRIC]
+    assert [(row.base, row.is_rival, row.relative.value) for row in rows] == [
+        ("base", False, -0.5), ("best", True, 1.0),
+    ]  # fmt: skip
+    page = report_of(evaluations)
+    sentence = (
+        "learned, pelvis error rms, soft: 50 % lower than base, its base; 100 % higher than best, the best policy "
+        "without learning."
+    )
+    assert sentence in page
+    assert sentence in Path("runs/x/report.md").read_text()
+    headings = re.findall(r"<h2 id=\"s\d+\">([^<]*)</h2>", page)
+    assert headings[2:5] == ["Residuals against their base", "Residuals against the best policy without learning",
+                             "Baselines against one another"]  # fmt: skip
+    with write_statistics(changes(evaluations), Path("s.csv")).open(newline="") as file:
+        roles = {(row["policy"], row["base"]): row["base_is"] for row in csv.DictReader(file)}
+    assert roles["learned", "base"] == "base of the residual"
+    assert roles["learned", "best"] == "best policy without learning"
 
 
 SENTENCES: dict[str, tuple[Sequence[Sequence[float | None]], str]] = {

@@ -1,7 +1,10 @@
-"""Paired changes of a comparison: every residual against its base, and every baseline against the same base."""
+"""Paired changes of a comparison: every residual against its base and against the best policy without learning.
+
+Every baseline is compared with the base of the residuals, or without residuals with the first policy.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,8 @@ from train.evaluate.statistics import Estimate, change, improvement, over_seeds,
 CEILING, HELD_OUT, SAME_ROBOT = "ceiling on the training condition", "held out", "trained robot"
 """Scenario in which nothing is random: training and evaluation see the same; one that training never saw; one whose
 only robot is that of the training, so that evaluation differs by noise alone."""
+BEST_ANALYTIC = "best policy without learning"
+"""What a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
 """Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
 misses the truth, over five every eleventh."""
@@ -49,6 +54,7 @@ class Change:
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
+        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
     """
 
     policy: str
@@ -72,6 +78,7 @@ class Change:
     base_falls: int
     base_episodes: int
     failure: str
+    is_rival: bool = False
 
     @property
     def num_seeds(self) -> int:
@@ -186,7 +193,7 @@ def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
-    """All paired changes: residuals against their bases, baselines against these or, without residuals, the first.
+    """All paired changes: residuals against bases and rivals, baselines against bases or, without residuals, the first.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -194,14 +201,20 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
     """
     trained = families(evaluations)
     titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    bases = {e.condition.policy.title: e.condition.member.base for e in evaluations if e.condition.member}
-    default = list(dict.fromkeys(bases.values())) or titles[:1]
+    members = {e.condition.policy.title: e.condition.member for e in evaluations if e.condition.member}
+    default = list(dict.fromkeys(member.base for member in members.values())) or titles[:1]
     rows = []
     for title in titles:
         own = [e for e in evaluations if e.condition.policy.title == title]
-        for base in [bases[title]] if title in bases else [base for base in default if base != title]:
+        member = members.get(title)
+        opponents = [base for base in default if base != title] if member is None else [member.base]
+        if member is not None and member.rival is not None:
+            opponents.append(member.rival)
+        for base in opponents:
             theirs = [e for e in evaluations if e.condition.policy.title == base]
-            rows += _against(own, theirs, trained.get(title), groups or {})
+            found = _against(own, theirs, trained.get(title), groups or {})
+            is_rival = member is not None and base == member.rival
+            rows += [replace(row, is_rival=True) for row in found] if is_rival else found
     return rows
 
 

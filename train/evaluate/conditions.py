@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, field_validator
 
+from baselines.catalogue import Track
 from baselines.policies import sensors_needed
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.errors import shown
@@ -53,6 +54,8 @@ class PolicySpec(Model):
     """Arguments of the environment for this policy alone, such as form: rigid."""
     level: bool = False
     """In a sweep: whether it plays once without the swept option, as a level to compare with."""
+    track: Track | None = None
+    """On a leaderboard: what it needs; None for what is known of it, and of one's own policy the standard sensors."""
 
     _checked = field_validator("env_options")(_options)
 
@@ -71,6 +74,9 @@ class Member(Model):
     """Seed that it was trained with; None where nothing says it."""
     base: str
     """Title of the policy that it corrects."""
+    rival: str | None = None
+    """Title of the best policy without learning and with the standard sensors; None where that is the base, or nobody
+    plays it."""
 
 
 class Condition(Model):

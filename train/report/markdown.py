@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from train.evaluate.changes import Change, by_line, percent_interval
+from train.evaluate.changes import BEST_ANALYTIC, Change, by_line, percent_interval
 from train.report.changes_tables import falls
 from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
 from train.runs.escaping import markdown_table, markdown_text
@@ -18,7 +18,8 @@ def markdown(results: Results) -> str:
     ]
     parts += ["## In short", _bullets(in_short(results))]
     for title, rows in (
-        ("Residuals against their base", [row for row in results.changes if row.is_family]),
+        ("Residuals against their base", [row for row in results.changes if row.is_family and not row.is_rival]),
+        (f"Residuals against the {BEST_ANALYTIC}", [row for row in results.changes if row.is_rival]),
         ("Baselines against one another", [row for row in results.changes if not row.is_family]),
     ):
         if rows:

@@ -7,7 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from train.evaluate.changes import (
+    BEST_ANALYTIC,
     CEILING,
     FEWEST_SEEDS,
     HELD_OUT,
@@ -16,6 +19,7 @@ from train.evaluate.changes import (
     by_cell,
     families,
     level,
+    percent,
     percent_interval,
 )
 from train.evaluate.environments import Column
@@ -106,26 +110,74 @@ def _trained(origin: Origin) -> str:
 
 
 def in_short(results: Results) -> list[str]:
-    """A line per residual and metric: in how many cells it is better, worse, or neither."""
-    found = []
+    """What learning adds in a sentence each; then per residual and metric in how many cells it is better, or worse."""
+    found = claims(results)
     for title in results.families:
-        rows = [row for row in results.changes if row.policy == title and row.is_judged]
-        for column in dict.fromkeys(row.column for row in rows):
-            own = [row for row in rows if row.column == column]
-            found += [
-                f"{title} against {row.base}, {column.title}, pooled over {row.scope}{_at(results, row)}: "
-                f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
-                for row in own
-                if row.is_group
-            ]
-            cells = [row for row in own if not row.is_group]
-            if cells:
-                found.append(f"{title} against {cells[0].base}, {column.title}: {_tally(cells)}.")
-        worse = [row for row in rows if row.falls_more and not row.is_group]
-        if worse:
-            where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
-            found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
+        for is_rival in (False, True):
+            rows = [r for r in results.changes if r.policy == title and r.is_judged and r.is_rival == is_rival]
+            for column in dict.fromkeys(row.column for row in rows):
+                found += _of_a_metric(results, [row for row in rows if row.column == column])
+            worse = [row for row in rows if row.falls_more and not row.is_group]
+            if worse:
+                where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
+                found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
     return found or ["No residual takes part: there are no training seeds, and differences are differences of means."]
+
+
+def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
+    """Lines of a residual in one metric against one other policy: pooled figures, and in how many cells what holds."""
+    found = [
+        f"{row.policy} against {row.base}, {row.column.title}, pooled over {row.scope}{_at(results, row)}: "
+        f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
+        for row in own
+        if row.is_group
+    ]
+    cells = [row for row in own if not row.is_group]
+    if cells:
+        found.append(f"{cells[0].policy} against {cells[0].base}, {cells[0].column.title}: {_tally(cells)}.")
+    return found
+
+
+def claims(results: Results) -> list[str]:
+    """What learning adds to the base of a residual, and to the best policy without learning: a sentence per scope.
+
+    Scopes are the groups; without groups the scenarios, where there are few.
+    """
+    judged = [row for row in results.changes if row.is_family and row.is_judged]
+    rivals = [row for row in judged if row.is_rival]
+    pooled = [row for row in rivals if row.is_group]
+    few = len({(row.policy, row.reference, row.scope, *row.swept.items()) for row in rivals}) <= _MOST_CLAIMS
+    found = []
+    for rival in pooled or (rivals if few else []):
+        base = next(
+            row for row in judged
+            if not row.is_rival
+            and (row.policy, row.reference, row.scope, row.is_group, row.swept, row.column)
+            == (rival.policy, rival.reference, rival.scope, rival.is_group, rival.swept, rival.column)
+        )  # fmt: skip
+        where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
+        found.append(
+            f"{rival.policy}, {rival.column.title}, {where}: {_compared(base)} than {base.base}, its base; "
+            f"{_compared(rival)} than {rival.base}, the {BEST_ANALYTIC}."
+        )
+    return found
+
+
+_MOST_CLAIMS = 4
+
+
+def _compared(row: Change) -> str:
+    """How much lower or higher, before "than"."""
+    value = row.relative.value
+    if not np.isfinite(value):
+        return "not comparable (no episode in which both stayed up), neither lower nor higher"
+    size = f"{percent(abs(value), signed=False)} {'higher' if value > 0.0 else 'lower'}"
+    return {
+        "lower": size,
+        "higher": size,
+        "none": "not shown to be lower or higher",
+        "unclear": f"{size} (too few training seeds to tell)",
+    }[row.verdict]
 
 
 def _besides(row: Change) -> str:
@@ -175,6 +227,12 @@ def notes(results: Results) -> list[str]:
         notes.append(
             "Better than base: share of all pairs of training seed and episode in which the residual is ahead, ties "
             "as one half."
+        )
+    if any(row.is_rival for row in results.changes):
+        notes.append(
+            f"The {BEST_ANALYTIC} reads the same sensors as the residual (encoders, foot sensors and IMU). The change "
+            "against the base says what learning adds to that compensator; the change against this policy says what it "
+            "adds to good practice."
         )
     marks = {mark for row in results.changes for mark in row.marks}
     if any(mark.startswith(HELD_OUT) for mark in marks):

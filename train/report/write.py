@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
-from train.evaluate.changes import by_line
+from train.evaluate.changes import BEST_ANALYTIC, by_line
 from train.evaluate.evaluate import Evaluation
 from train.figures.figures import has_swept_references
 from train.report.charts import forest, ladder
@@ -81,22 +81,28 @@ def _add_ladder(page: Page, results: Results) -> None:
 
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
-    trained = [row for row in results.changes if row.is_family]
+    trained = [row for row in results.changes if row.is_family and not row.is_rival]
+    against_best = [row for row in results.changes if row.is_rival]
     others = [row for row in results.changes if not row.is_family]
     more = {"colour": results.lines.colour, "swept": results.swept_options}
-    if trained:
+    for name, rows in (
+        ("Residuals against their base", trained),
+        (f"Residuals against the {BEST_ANALYTIC}", against_best),
+    ):
+        if not rows:
+            continue
         drawn = results.swept is None
         marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
         page.section(
-            "Residuals against their base",
+            name,
             "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below "
             f"zero; red: above; grey: it includes zero, or there are too few training seeds.{marks}",
         )
-        for title in dict.fromkeys(row.policy for row in trained if drawn):
-            own = [row for row in trained if row.policy == title and row.is_judged]
+        for title in dict.fromkeys(row.policy for row in rows if drawn):
+            own = [row for row in rows if row.policy == title and row.is_judged]
             page.add("heading", f"{title} against {own[0].base}")
             page.add("chart", forest(own))
-        page.add("changes", {"lines": by_line(trained), **more}, _if_long("Table of changes", trained))
+        page.add("changes", {"lines": by_line(rows), **more}, _if_long("Table of changes", rows))
     if others:
         page.section(
             "Baselines against one another",
