@@ -19,9 +19,10 @@ from rich.console import Console
 
 import train.experiments.compare
 from baselines.catalogue import BEST_ON_THE_WALKER
-from baselines.residual.residual import ResidualDescription, read_description
+from baselines.residual.residual import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
+from tests.cells import METRIC, cell, describe, family, records
 from train.commands.cli import main
 from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
 from train.evaluate.conditions import Condition, Member, PolicySpec
@@ -38,16 +39,7 @@ from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
-METRIC = "pelvis_error_rms_rad"
 POSITIVE = st.floats(1e-3, 1e3)
-
-
-def records(values: Sequence[float | None], first: int = 0) -> list[dict[str, Any]]:
-    """Episodes with one metric; None is a fall, with a figure that must not count."""
-    return [
-        {"seed": first + i, "termination": "" if value is not None else "fell", METRIC: 9.0 if value is None else value}
-        for i, value in enumerate(values)
-    ]
 
 
 def pairs(mine: Sequence[float], base: Sequence[float]) -> Pairs:
@@ -144,21 +136,6 @@ def test_probability_of_improvement_counts_all_pairs_of_seed_and_episode() -> No
 
 
 # Families.
-
-
-def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:
-    """A folder that says of itself what a residual does, without weights."""
-    config = {
-        "scenarios": ["ideal", "soft", "ideal+soft", "ideal+spread"],
-        "reference": 3,
-        "seeds": [1, 2, 10],
-        **values.pop("config", {}),
-    }
-    training = {"config": config} if seed is None else {"config": config, "seed": seed}
-    description = ResidualDescription(**{"robot": "walker", "base": "input_output", "training": training, **values})
-    folder.mkdir(parents=True)
-    (folder / "residual.json").write_text(description.model_dump_json())
-    return folder
 
 
 @pytest.fixture(autouse=True)
@@ -315,35 +292,6 @@ def test_a_residual_on_a_residual_is_refused() -> None:
 
 
 # Changes and their sentences.
-
-
-def cell(title: str, values: dict[str, Sequence[float | None]], scenario: str, member: Member | None = None,
-         reference: Any = 3, time: int = 400) -> Evaluation:  # fmt: skip
-    """A cell of the walker without physics: metrics, and a trace that any signal may be drawn from."""
-    spec = PolicySpec(name="zero" if member is None else f"residual:{member.folder}", label=title)
-    condition = Condition(env="walker", policy=spec, member=member, scenario=scenario, reference=reference)
-    episodes = [
-        {**record, "pelvis_error_rms_rad": value, "zmp_deviation_rms_m": value, "policy": title}
-        for key in values for record, value in zip(records(values[key]), values[key], strict=True)
-    ]  # fmt: skip
-    t = 0.004 * np.arange(time)
-    trace = {name: np.sin(t) for name in condition.environment.traced} | {
-        "time_s": t, "single_support": (t > 0.5).astype(float),
-    }  # fmt: skip
-    trace["zmp_y"] = np.where(t < 0.1, np.nan, trace["zmp_y"])
-    return Evaluation(condition, episodes, trace)
-
-
-def family(values: Sequence[Sequence[float | None]], scenario: str = "soft", **more: Any) -> list[Evaluation]:
-    """Cells of the training seeds of a residual, whose folders are made if they are not there."""
-    cells = []
-    for seed, own in enumerate(values):
-        folder = Path(f"seed_{seed}")
-        if not folder.exists():
-            describe(folder, seed)
-        member = Member(folder=str(folder), training_seed=seed, base="base")
-        cells.append(cell("learned", {"all": own}, scenario, member, **more))
-    return cells
 
 
 def only(rows: Sequence[Change], policy: str = "learned") -> Change:

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from train.evaluate.changes import BEST_ANALYTIC, CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
+from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate
 from train.runs.escaping import csv_row
 
@@ -26,6 +27,32 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
     return path
 
 
+def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
+    """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as they are shown."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(_MAP_HEAD)
+        for found in maps:
+            ticks = found.x.ticks(found.known), found.y.ticks(found.known)
+            for y, row in zip(ticks[1], found.cells, strict=True):
+                for x, cell in zip(ticks[0], row, strict=True):
+                    for title, estimate in cell.levels.items():
+                        change = cell.learned.get(title)
+                        against = ("",) * 4 if change is None else (*_cells(change.relative), change.verdict)
+                        own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
+                        marks = [title == cell.best, title == cell.best_analytic]
+                        writer.writerow(
+                            csv_row(
+                                [*own, *_cells(estimate), *cell.failed[title], *marks, cell.best_analytic, *against]
+                            )
+                        )
+    return path
+
+
+_MAP_HEAD = (
+    "map", "x_is", "x", "y_is", "y", "metric", "policy", "mean", "mean_low", "mean_high", "failed", "episodes",
+    "is_best", "is_best_without_learning", "best_without_learning", "change", "change_low", "change_high", "verdict",
+)  # fmt: skip
 _HEAD = ("policy", "base", "base_is", "kind", "reference", "scope", "pooled", "marks")
 _FIGURES = (
     "metric", "base_mean", "mean", "change", "change_low", "change_high", "improvement", "improvement_low",

@@ -25,6 +25,7 @@ from train.evaluate.changes import (
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.families import Origin
+from train.evaluate.maps import HeatMap
 from train.evaluate.progress import Curves, learning_curves
 from train.report.parts import Lines, number_interval
 
@@ -45,6 +46,7 @@ class Results:
         changes: Paired changes.
         folder: Where the comparison's files are, with its metadata.
         swept: What the axis of a sweep says; None without one.
+        maps: Heat maps over two axes, where such are wanted.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Results:
     changes: list[Change]
     folder: Path
     swept: str | None = None
+    maps: Sequence[HeatMap] = ()
 
     @cached_property
     def families(self) -> dict[str, Origin]:
@@ -74,6 +77,11 @@ class Results:
     def metadata(self) -> Mapping[str, Any]:
         """Origin of the comparison: date, seed, commit, versions."""
         return json.loads((self.folder / "metadata.json").read_text(encoding="utf-8"))
+
+    @property
+    def has_conditions(self) -> bool:
+        """Whether its cells are conditions of their own, and not points of a curve or a map."""
+        return self.swept is None and not self.maps
 
     @property
     def swept_options(self) -> list[str]:
@@ -111,7 +119,7 @@ def _trained(origin: Origin) -> str:
 
 def in_short(results: Results) -> list[str]:
     """What learning adds in a sentence each; then per residual and metric in how many cells it is better, or worse."""
-    found = claims(results)
+    found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)] + claims(results)
     for title in results.families:
         for is_rival in (False, True):
             rows = [r for r in results.changes if r.policy == title and r.is_judged and r.is_rival == is_rival]
@@ -122,6 +130,23 @@ def in_short(results: Results) -> list[str]:
                 where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
                 found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
     return found or ["No residual takes part: there are no training seeds, and differences are differences of means."]
+
+
+def of_a_map(heat_map: HeatMap) -> list[str]:
+    """Who is best in how many cells of a map, and where learning is ahead of the best policy without it."""
+    where, cells = f"{heat_map.column.title}, {heat_map.title}", heat_map.flat
+    wins = {title: sum(cell.best == title for cell in cells) for title in heat_map.policies}
+    ranking = sorted((title for title in wins if wins[title]), key=lambda title: -wins[title])
+    found = [
+        f"{where}: best of {len(cells)} cells: " + ", ".join(f"{title} in {wins[title]}" for title in ranking) + "."
+    ]
+    for title in heat_map.families:
+        rows = [cell.learned[title] for cell in cells if title in cell.learned]
+        values = [row.relative.value for row in rows if np.isfinite(row.relative.value)]
+        if values:
+            span = f"from {percent(min(values))} to {percent(max(values))}"
+            found.append(f"{where}: {title} against the {BEST_ANALYTIC} of each cell: {_tally(rows)}; {span}.")
+    return found
 
 
 def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
@@ -227,6 +252,12 @@ def notes(results: Results) -> list[str]:
         notes.append(
             "Better than base: share of all pairs of training seed and episode in which the residual is ahead, ties "
             "as one half."
+        )
+    if results.maps:
+        notes.append(
+            f"The {BEST_ANALYTIC} of a cell is the one with the lowest mean on that cell's episodes, among those that "
+            "read the standard sensors. It is chosen after the fact, which favours it. Failures count before scores: "
+            "who fails less often is the better one. A star: not told from chance, or too few training seeds."
         )
     if any(row.is_rival for row in results.changes):
         notes.append(

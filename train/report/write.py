@@ -7,6 +7,7 @@ from elastic_env.core.errors import missing_extra
 from train.evaluate.changes import BEST_ANALYTIC, by_line
 from train.evaluate.evaluate import Evaluation
 from train.figures.figures import has_swept_references
+from train.figures.map_plots import panels
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
 from train.report.markdown import markdown
@@ -44,13 +45,15 @@ def _page(results: Results) -> Page:
     page.section("What was compared")
     page.add("definitions", what(results))
     page.add("bullets", in_short(results))
-    if results.swept is None:
+    _add_maps(page, results)
+    if results.has_conditions:
         _add_ladder(page, results)
     _add_changes(page, results)
     _add_phases(page, results)
-    if results.swept is None:
+    if results.has_conditions:
         _add_curves(page, results)
-    _add_sweeps(page, results)
+    if not results.maps:
+        _add_sweeps(page, results)
     if results.learning:
         page.section(
             "Learning curves",
@@ -61,6 +64,23 @@ def _page(results: Results) -> Page:
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
+
+
+def _add_maps(page: Page, results: Results) -> None:
+    """Heat maps: who is best, learning against the best policy without it, and folded away every policy's score."""
+    if not results.maps:
+        return
+    page.section(
+        "Maps",
+        "Who is best where, and what learning changes against the best policy without it, in per cent: green and below "
+        "zero, learning is ahead; red and above zero, it is behind. A star: not told from chance, or too few training "
+        "seeds. A cross counts failed episodes.",
+    )
+    for heat_map in results.maps:
+        found = panels(heat_map)
+        page.add("heading", capital(f"{heat_map.column.title}, {heat_map.title}"))
+        page.add("map", [panel for panel in found if panel.is_main])
+        page.add("map", [panel for panel in found if not panel.is_main], folded="Scores of every policy")
 
 
 def _add_ladder(page: Page, results: Results) -> None:
@@ -91,7 +111,7 @@ def _add_changes(page: Page, results: Results) -> None:
     ):
         if not rows:
             continue
-        drawn = results.swept is None
+        drawn = results.has_conditions
         marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
         page.section(
             name,
