@@ -60,7 +60,9 @@ class Axis(Model):
 
     def place(self, condition: Condition) -> int:
         """Which of its values a condition has."""
-        values = [condition.environment.arguments(v) for v in self.values] if self.is_motion else self.values
+        values: list[Any] = self.values
+        if self.is_motion:
+            values = [condition.environment.arguments(value) for value in values]
         mine = condition.environment.arguments(condition.reference) if self.is_motion else condition.swept[self.what]
         return values.index(mine)
 

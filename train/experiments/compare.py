@@ -16,11 +16,14 @@ from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, 
 from train.evaluate.environments import Environment, Reference, environment
 from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
 from train.evaluate.families import expand
+from train.evaluate.leaderboard import standings
 from train.evaluate.maps import MapConfig, heat_maps
+from train.experiments.timing import step_times
 from train.figures import plots
 from train.figures.figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.changes_tables import print_changes, write_maps, write_statistics
+from train.report.leaderboard import write_leaderboard
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
@@ -66,6 +69,10 @@ class CompareConfig(Model):
     """Two axes to vary, for heat maps: fields of the scenario, or the motion, whose values are then the references."""
     groups: dict[str, list[str]] = {}
     """Scenarios that paired changes are also pooled over, by the name of the group."""
+    reference_scenarios: dict[str, list[Title]] = {}
+    """Scenarios of single references, by their names in tables, where not all are played: {24 s: [nominal]}."""
+    leaderboard: bool = False
+    """Whether a leaderboard is written: policies in tracks, groups and motions as columns, and the time of a step."""
 
     @model_validator(mode="before")
     @classmethod
@@ -108,6 +115,7 @@ class CompareConfig(Model):
                 raise ConfigurationError(
                     f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got {shown(episodes)}"
                 )
+        self._require_reference_scenarios()
         for name, scenarios in self.groups.items():
             if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
                 raise ConfigurationError(
@@ -118,6 +126,20 @@ class CompareConfig(Model):
                 if scenario not in self.scenarios:
                     raise unknown_name(f"scenario of the group {name!r}", scenario, self.scenarios)
         return self
+
+    def _require_reference_scenarios(self) -> None:
+        """Refuse scenarios of references that are not played, and a leaderboard of what none can be of."""
+        for name, scenarios in self.reference_scenarios.items():
+            if name not in self._reference_names():
+                raise unknown_name("reference with scenarios of its own", name, self._reference_names())
+            if not scenarios:
+                raise ConfigurationError(f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}")
+            _require_each_once(f"scenario of {name!r}", scenarios)
+            for scenario in scenarios:
+                if scenario not in self.scenarios:
+                    raise unknown_name(f"scenario of {name!r}", scenario, self.scenarios)
+        if self.leaderboard and (self.sweep is not None or self.map is not None or environment(self.env).is_real):
+            raise ConfigurationError("a leaderboard is of simulated cells without a sweep or a map; leave these out")
 
     def _require_map(self) -> None:
         """Refuse a map that its environment does not have, or that something else of the comparison contradicts."""
@@ -143,7 +165,9 @@ class CompareConfig(Model):
         """
         entrants = expand(self.policies, with_bases)
         swept = len(self.sweep.values) if self.sweep else len(self.map.coordinates()) if self.map else 1
-        cells = len(self.references) * len(self.scenarios) * len(entrants) * swept
+        own = self.reference_scenarios
+        played = {name: own.get(name, self.scenarios) for name in self._reference_names()}
+        cells = sum(map(len, played.values())) * len(entrants) * swept
         if cells > _MOST_CELLS:
             raise ConfigurationError(
                 f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)} references x "
@@ -156,8 +180,10 @@ class CompareConfig(Model):
                 env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
-            for reference, label in zip(self.references, self._reference_labels(), strict=True)
-            for scenario in self.scenarios
+            for reference, label, scenarios in zip(
+                self.references, self._reference_labels(), played.values(), strict=True
+            )
+            for scenario in scenarios
             for entrant in entrants
             for swept in self._swept(entrant.policy)
         ]  # fmt: skip
@@ -236,9 +262,14 @@ def compare(
         if maps:
             files.append(write_maps(maps, folder / "map.csv"))
         rows = changes(evaluations, config.groups) if report else []
+        board = []
+        if config.leaderboard:
+            console.print("measuring the time of every policy, in turn")
+            board = standings(evaluations, rows, config.groups, step_times(conditions))
+            files += write_leaderboard(board, folder)
         if report:
             files.append(write_statistics(rows, folder / "statistics.csv"))
-            files += write_report(Results(config.name, evaluations, rows, folder, axis, maps))
+            files += write_report(Results(config.name, evaluations, rows, folder, axis, maps, board))
     print_summary(cells, console)
     print_changes(rows, console)
     return Comparison(folder, evaluations, files)

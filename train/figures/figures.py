@@ -90,9 +90,7 @@ def reference_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
 
 
 def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment, folder: Path) -> list[Path]:
-    if not has_swept_references(evaluations):
-        return []
-    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    scenarios = swept_scenarios(evaluations)
     return [
         draw_sweep(
             reference_curves([e for e in evaluations if e.condition.scenario == scenario]), f"{known.quantity} [s]",
@@ -128,6 +126,14 @@ _FIGURES: dict[str, Draw] = {
     "pelvis": draw_pelvis,
     "zmp": draw_zmp,
 }
+
+
+def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
+    """Scenarios in which the references that are played are points of one axis."""
+    found: dict[str, list[Evaluation]] = {}
+    for e in evaluations:
+        found.setdefault(e.condition.scenario, []).append(e)
+    return [scenario for scenario, own in found.items() if has_swept_references(own)]
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 from train.evaluate.changes import BEST_ANALYTIC, Change, by_line, percent_interval
 from train.figures.map_plots import in_rows, panels
 from train.report.changes_tables import falls
+from train.report.leaderboard import leaderboard_markdown
 from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
 from train.runs.escaping import markdown_table, markdown_text
 
@@ -18,6 +19,8 @@ def markdown(results: Results) -> str:
         _bullets(f"{term}: {text}" for term, text in what(results)),
     ]
     parts += ["## In short", _bullets(in_short(results))]
+    if results.standings:
+        parts += ["## Leaderboard", leaderboard_markdown(results.standings).rstrip()]
     for heat_map in results.maps:
         parts.append(f"## Map: {markdown_text(f'{heat_map.column.title}, {heat_map.title}')}")
         for panel in panels(heat_map):

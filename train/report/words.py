@@ -25,6 +25,7 @@ from train.evaluate.changes import (
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.families import Origin
+from train.evaluate.leaderboard import Standing
 from train.evaluate.maps import HeatMap
 from train.evaluate.progress import Curves, learning_curves
 from train.report.parts import Lines, number_interval
@@ -47,6 +48,7 @@ class Results:
         folder: Where the comparison's files are, with its metadata.
         swept: What the axis of a sweep says; None without one.
         maps: Heat maps over two axes, where such are wanted.
+        standings: Rows of the leaderboard, where one is wanted.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Results:
     folder: Path
     swept: str | None = None
     maps: Sequence[HeatMap] = ()
+    standings: Sequence[Standing] = ()
 
     @cached_property
     def families(self) -> dict[str, Origin]:

@@ -6,10 +6,11 @@ from pathlib import Path
 from elastic_env.core.errors import missing_extra
 from train.evaluate.changes import BEST_ANALYTIC, by_line
 from train.evaluate.evaluate import Evaluation
-from train.figures.figures import has_swept_references
+from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
+from train.report.leaderboard import LEGEND, PAIRED, board, paired_rows, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
@@ -45,6 +46,7 @@ def _page(results: Results) -> Page:
     page.section("What was compared")
     page.add("definitions", what(results))
     page.add("bullets", in_short(results))
+    _add_leaderboard(page, results)
     _add_maps(page, results)
     if results.has_conditions:
         _add_ladder(page, results)
@@ -64,6 +66,23 @@ def _page(results: Results) -> Page:
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
+
+
+def _add_leaderboard(page: Page, results: Results) -> None:
+    """The leaderboard, what learning adds, and folded away the single scenarios."""
+    found = results.standings
+    if not found:
+        return
+    main, single = board(found), scenarios_board(found)
+    page.section("Leaderboard", f"{capital(main.what)}. {LEGEND}")
+    page.add("board", main)
+    head, rows = paired_rows(found)
+    if rows:
+        page.add("heading", "What learning adds")
+        page.add("text", PAIRED)
+        page.add("table", {"head": head, "rows": rows, "words": 3})
+    if single is not None:
+        page.add("board", single, folded=f"Single scenarios, {main.columns[0][1]}")
 
 
 def _add_maps(page: Page, results: Results) -> None:
@@ -170,8 +189,8 @@ def _add_sweeps(page: Page, results: Results) -> None:
                     t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
                 }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
-    elif has_swept_references(results.evaluations):
-        for scenario in lines.scenarios:
+    else:
+        for scenario in swept_scenarios(results.evaluations):
             points = {t: _by_number(lines.cell(t, scenario=scenario)) for t in lines.titles}
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
     if not charts:
