@@ -328,8 +328,8 @@ def test_a_residual_is_compared_with_its_base_and_with_the_best_policy_without_l
     ]  # fmt: skip
     page = report_of(evaluations)
     sentence = (
-        "learned, pelvis error rms, soft: 50 % lower than base, its base; 100 % higher than best, the best policy "
-        "without learning."
+        "learned, pelvis error rms, soft (trained robot): 50 % lower than base, its base [−50, −50]; 100 % higher than "
+        "best, the best policy without learning [+100, +100]."
     )
     assert sentence in page
     assert sentence in Path("runs/x/report.md").read_text()

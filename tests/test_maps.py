@@ -136,7 +136,7 @@ def grid(values: dict[tuple[float, float], dict[str, list[float | None]]]) -> He
         for title, own in policies.items():
             found = family([own] * 5, "nominal") if title == "learned" else [cell(title, {"all": own}, "nominal")]
             evaluations += at(found, **{K: k, LOAD: load})
-    axes = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5]}}
+    axes: dict[str, Any] = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5]}}
     return heat_maps(evaluations, MapConfig(**axes))[0]
 
 
@@ -174,7 +174,7 @@ def test_the_truth_wins_no_cell_and_further_sensors_are_no_rival() -> None:
         *family([[3.0]] * 5, "nominal"),
     ]  # fmt: skip
     everywhere = [e for k in (0.7, 1.0) for m in (0.0, 5.0) for e in at(named, **{K: k, LOAD: m})]
-    axes = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5]}}
+    axes: dict[str, Any] = {"x": {"what": K, "values": [0.7, 1]}, "y": {"what": LOAD, "values": [0, 5]}}
     for found in heat_maps(everywhere, MapConfig(**axes))[0].flat:
         assert (found.best, found.best_analytic) == ("link_encoder", "base")
 

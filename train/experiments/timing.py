@@ -1,4 +1,4 @@
-"""How long policies take for a control step of one world, measured in turn on one thread."""
+"""How much processor time policies take for a control step of one world, measured in turn on one thread."""
 
 import statistics
 import time
@@ -15,10 +15,11 @@ _STEPS, _ROUNDS = 50, 15
 
 
 def step_times(conditions: Sequence[Condition], steps: int = _STEPS, rounds: int = _ROUNDS) -> dict[str, float]:
-    """Median time of every policy alone for a control step of one world [µs], by its title.
+    """Median processor time of every policy alone for a control step of one world [µs], by its title.
 
     The policies play in turn, round by round, so that what else the computer does concerns all of them alike. The
-    first round compiles and warms up, and does not count. Of a residual the first training seed plays.
+    first round compiles and warms up, and does not count. Of a residual the first training seed plays. Processor time
+    does not count what other programs take meanwhile.
 
     Args:
         conditions: Cells of a comparison; each policy plays the first of its own.
@@ -56,11 +57,11 @@ class _Player:
         """Play control steps; the time that the policy alone took [s]."""
         spent_s = 0.0
         for _ in range(steps):
-            begin = time.perf_counter()
+            begin = time.process_time()
             action, self._state = self._policy.predict(
                 self._observation, state=self._state, episode_start=self._start, deterministic=True
             )
-            spent_s += time.perf_counter() - begin
+            spent_s += time.process_time() - begin
             self._observation, _, terminated, truncated, _ = self._env.step(action)
             self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
         return spent_s

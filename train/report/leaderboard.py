@@ -39,13 +39,13 @@ class Entry:
     Attributes:
         figures: A figure per metric; "-" where there is none.
         is_best: Whether each is the best of its track.
-        interval: Intervals over training seeds; empty without them.
+        intervals: Interval of each over training seeds; empty without them.
         failed: Failed episodes of all; empty where none failed.
     """
 
     figures: tuple[str, ...]
     is_best: tuple[bool, ...]
-    interval: str
+    intervals: tuple[str, ...]
     failed: str
 
 
@@ -145,13 +145,13 @@ def _totals(policy: str, everything: Sequence[Standing]) -> tuple[str, str]:
 def _entry(own: Sequence[Standing | None], is_best: tuple[bool, ...]) -> Entry:
     found = [s for s in own if s is not None]
     if not found:
-        return Entry(("not played",), (False,), "", "")
+        return Entry(("not played",), (False,), (), "")
     factors = [_column(s).scale for s in found]
     scores = [s.score.scaled(factor) for s, factor in zip(found, factors, strict=True)]
-    intervals = [_interval(score.low, score.high) for score in scores if score.has_interval]
+    intervals = tuple(_interval(score.low, score.high) for score in scores if score.has_interval)
     failed = f"✕{found[0].failed}/{found[0].episodes}" if found[0].failed else ""
     figures = tuple(three_digits(score.value) for score in scores)
-    return Entry(figures, is_best, " / ".join(intervals), failed)
+    return Entry(figures, is_best, intervals, failed)
 
 
 def _interval(low: float | None, high: float | None) -> str:
@@ -189,8 +189,8 @@ def _said(paired: Paired | None) -> str:
 LEGEND = (
     "Lower is better. Each cell is a mean over the scenarios of means over the episodes that did not fail; bold is the "
     "best of its track. Of a residual it is the interquartile mean over training seeds, with the 95 % interval below. "
-    "✕ counts the episodes that failed, such as by a fall: who fails less often is the better one. µs: time of "
-    "the policy alone for a control step of one world on one thread, median of one interleaved run."
+    "✕ counts the episodes that failed, such as by a fall: who fails less often is the better one. µs: processor time "
+    "of the policy alone for a control step of one world on one thread, median of one interleaved run."
 )
 PAIRED = (
     "Paired changes on the same episodes: interquartile mean over training seeds with its 95 % interval. Below zero, "
@@ -198,10 +198,18 @@ PAIRED = (
 )
 
 
+def legend(found: Sequence[Standing]) -> str:
+    """What a cell holds, and of how many episodes."""
+    what = board(found).what
+    counts = sorted({s.episodes // max(s.training_seeds, 1) for s in found if not s.is_group})
+    span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
+    return f"{what[:1].upper()}{what[1:]}; episodes of a scenario, per training seed: {span}. {LEGEND}"
+
+
 def leaderboard_markdown(found: Sequence[Standing]) -> str:
     """The tables of the leaderboard."""
     main, single = board(found), scenarios_board(found)
-    parts = [f"{main.what[:1].upper()}{main.what[1:]}. {LEGEND}", _board_markdown(main)]
+    parts = [legend(found), _board_markdown(main)]
     head, rows = paired_rows(found)
     if rows:
         rules = ["---"] * 3 + ["---:"] * 2
@@ -231,7 +239,7 @@ def _line(cells: Iterable[str]) -> str:
 def _entry_markdown(entry: Entry) -> str:
     figures = [f"**{text}**" if best else text for text, best in zip(entry.figures, entry.is_best, strict=True)]
     failed = f" {entry.failed}" if entry.failed else ""
-    return " / ".join(figures) + failed + (f"<br><sub>{entry.interval}</sub>" if entry.interval else "")
+    return " / ".join(figures) + failed + "".join(f"<br><sub>{interval}</sub>" for interval in entry.intervals)
 
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:

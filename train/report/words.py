@@ -158,7 +158,7 @@ def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
         f"{row.policy} against {row.base}, {row.column.title}, pooled over {row.scope}{_at(results, row)}: "
         f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
         for row in own
-        if row.is_group
+        if row.is_group and not any(c.is_rival and c.policy == row.policy for c in results.changes)
     ]
     cells = [row for row in own if not row.is_group]
     if cells:
@@ -185,13 +185,20 @@ def claims(results: Results) -> list[str]:
         )  # fmt: skip
         where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
         found.append(
-            f"{rival.policy}, {rival.column.title}, {where}: {_compared(base)} than {base.base}, its base; "
-            f"{_compared(rival)} than {rival.base}, the {BEST_ANALYTIC}."
+            f"{rival.policy}, {rival.column.title}, {where}{marked(rival)}: {_compared(base)} than {base.base}, its "
+            f"base{_bounds(base)}; {_compared(rival)} than {rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}."
         )
     return found
 
 
 _MOST_CLAIMS = 4
+"""Scopes and metrics of which each has a sentence, without groups."""
+
+
+def _bounds(row: Change) -> str:
+    """The interval of a change."""
+    text = percent_interval(row.relative)
+    return text[text.index(" [") :] if row.relative.has_interval else ""
 
 
 def _compared(row: Change) -> str:

@@ -10,7 +10,7 @@ from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
-from train.report.leaderboard import LEGEND, PAIRED, board, paired_rows, scenarios_board
+from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
@@ -74,7 +74,7 @@ def _add_leaderboard(page: Page, results: Results) -> None:
     if not found:
         return
     main, single = board(found), scenarios_board(found)
-    page.section("Leaderboard", f"{capital(main.what)}. {LEGEND}")
+    page.section("Leaderboard", legend(found))
     page.add("board", main)
     head, rows = paired_rows(found)
     if rows:
