@@ -27,18 +27,16 @@ from train.experiments.compare import CompareConfig, Sweep
 from train.experiments.timing import step_times
 from train.report import Results, write_report
 from train.report.leaderboard import (
-    BEGIN,
-    END,
     board,
     leaderboard_markdown,
-    page_with,
     paired_rows,
     read_leaderboard,
     scenarios_board,
     three_digits,
     write_leaderboard,
 )
-from train.report.leaderboard import main as write_page
+from train.report.leaderboard_page import BEGIN, END, page_with
+from train.report.leaderboard_page import main as write_page
 from train.runs.folders import run_folder
 
 ROOT = Path(__file__).parents[1]

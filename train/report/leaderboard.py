@@ -1,13 +1,7 @@
-"""The leaderboard as CSV, as Markdown, and as a page of the documentation, which is written from the CSV alone.
-
-    python -m train.report.leaderboard docs/results/leaderboard.csv docs/leaderboard.md
-
-writes the tables between the two marks of the page anew.
-"""
+"""The leaderboard as tables for the report, as CSV and as Markdown."""
 
 import csv
 import math
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +15,6 @@ from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
 from train.runs.escaping import csv_row, markdown_table, markdown_text
-
-BEGIN, END = "<!-- leaderboard: begin -->", "<!-- leaderboard: end -->"
-"""Marks of a page, between which the tables are written."""
 
 _HEAD = (
     "track", "policy", "reference", "scope", "pooled", "column", "title", "metric", "mean", "low", "high", "failed",
@@ -304,27 +295,3 @@ def _read_paired(cells: Sequence[str]) -> Paired | None:
 
 def _estimate(value: str, low: str, high: str) -> Estimate:
     return Estimate(float(value), float(low) if low else None, float(high) if high else None)
-
-
-def page_with(text: str, found: Sequence[Standing]) -> str:
-    """A page with the tables between its marks written anew.
-
-    Raises:
-        ConfigurationError: It does not have both marks, each once and in order.
-    """
-    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
-        raise ConfigurationError(f"a page for the leaderboard needs the lines {BEGIN!r} and {END!r}, each once")
-    before, _, rest = text.partition(BEGIN)
-    return f"{before}{BEGIN}\n\n{leaderboard_markdown(found)}\n{END}{rest.partition(END)[2]}"
-
-
-def main(arguments: Sequence[str]) -> None:
-    """Write the tables of a page from a leaderboard.csv: CSV, PAGE."""
-    if len(arguments) != 2:
-        raise SystemExit("usage: python -m train.report.leaderboard LEADERBOARD.csv PAGE.md")
-    table, page = map(Path, arguments)
-    page.write_text(page_with(page.read_text(encoding="utf-8"), read_leaderboard(table)), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
