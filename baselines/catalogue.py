@@ -215,3 +215,8 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
 """Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""
+
+BEST_ON_THE_WALKER: str | None = "adaptive_posture"
+"""Best policy of the walker that needs no training and reads the standard sensors; residuals are compared with it."""
+BEST_ON_JOINTS: str | None = None
+"""The same for robots on a fixed base; None while there is none."""

@@ -4,7 +4,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from baselines.catalogue import ASSUMED_OPTIONS, ON_JOINTS, ON_THE_WALKER, NamedPolicy, Track
+from baselines.catalogue import (
+    ASSUMED_OPTIONS,
+    BEST_ON_JOINTS,
+    BEST_ON_THE_WALKER,
+    ON_JOINTS,
+    ON_THE_WALKER,
+    NamedPolicy,
+    Track,
+)
 from baselines.compensation.policy import Policy
 from baselines.options import PolicyOptions
 from baselines.residual.residual import RESIDUAL, read_description, residual_policy
@@ -28,6 +36,11 @@ def track(name: str, is_walker: bool = True) -> Track:
         return Track.TRAINING
     known = named_policy(name, is_walker)
     return Track.STANDARD if known is None else known.track
+
+
+def best_analytic(is_walker: bool = True) -> str | None:
+    """The best policy without learning that reads the standard sensors, by its name; None where none is named."""
+    return BEST_ON_THE_WALKER if is_walker else BEST_ON_JOINTS
 
 
 def sensors_needed(name: str) -> tuple[str, ...]:

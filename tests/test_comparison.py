@@ -18,9 +18,11 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import train.experiments.compare
-from baselines.residual.residual import ResidualDescription, read_description
+from baselines.catalogue import BEST_ON_THE_WALKER
+from baselines.residual.residual import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
+from tests.cells import METRIC, cell, describe, family, records
 from train.commands.cli import main
 from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
 from train.evaluate.conditions import Condition, Member, PolicySpec
@@ -37,16 +39,7 @@ from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
-METRIC = "pelvis_error_rms_rad"
 POSITIVE = st.floats(1e-3, 1e3)
-
-
-def records(values: Sequence[float | None], first: int = 0) -> list[dict[str, Any]]:
-    """Episodes with one metric; None is a fall, with a figure that must not count."""
-    return [
-        {"seed": first + i, "termination": "" if value is not None else "fell", METRIC: 9.0 if value is None else value}
-        for i, value in enumerate(values)
-    ]
 
 
 def pairs(mine: Sequence[float], base: Sequence[float]) -> Pairs:
@@ -145,21 +138,6 @@ def test_probability_of_improvement_counts_all_pairs_of_seed_and_episode() -> No
 # Families.
 
 
-def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:
-    """A folder that says of itself what a residual does, without weights."""
-    config = {
-        "scenarios": ["ideal", "soft", "ideal+soft", "ideal+spread"],
-        "reference": 3,
-        "seeds": [1, 2, 10],
-        **values.pop("config", {}),
-    }
-    training = {"config": config} if seed is None else {"config": config, "seed": seed}
-    description = ResidualDescription(**{"robot": "walker", "base": "input_output", "training": training, **values})
-    folder.mkdir(parents=True)
-    (folder / "residual.json").write_text(description.model_dump_json())
-    return folder
-
-
 @pytest.fixture(autouse=True)
 def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test works in a folder of its own, on a wide terminal without colours."""
@@ -178,12 +156,14 @@ def test_a_pattern_stands_for_all_training_seeds_in_natural_order_with_their_bas
     (Path("run") / "seed_0.txt").write_text("no folder")
     name = f"residual:{Path.cwd()}/run/seed_*/last" if absolute else FAMILY.name
     found = expand([PolicySpec(name="zero"), FAMILY.replace(name=name)])
-    assert [entrant.policy.title for entrant in found] == ["zero", "input_output", "learned", "learned", "learned"]
+    titles = [entrant.policy.title for entrant in found]
+    assert titles == ["zero", "input_output", BEST_ON_THE_WALKER, "learned", "learned", "learned"]
     members = [entrant.member for entrant in found if entrant.member is not None]
     assert [member.training_seed for member in members] == [1, 2, 10]
-    assert {member.base for member in members} == {"input_output"}
-    assert [entrant.policy.name for entrant in found][2:] == [f"residual:{member.folder}" for member in members]
-    assert len(expand([FAMILY.replace(name=name)], with_bases=False)) == 3
+    assert {(member.base, member.rival) for member in members} == {("input_output", BEST_ON_THE_WALKER)}
+    assert [entrant.policy.name for entrant in found][3:] == [f"residual:{member.folder}" for member in members]
+    alone = expand([FAMILY.replace(name=name)], with_bases=False)
+    assert [entrant.member.rival for entrant in alone if entrant.member] == [None] * 3
 
 
 def test_a_base_is_the_policy_with_the_same_options() -> None:
@@ -194,12 +174,29 @@ def test_a_base_is_the_policy_with_the_same_options() -> None:
         PolicySpec(name="input_output"),
         PolicySpec(name="input_output", label="weak", options={"stiffness_scale": 0.9}),
     )
-    assert [e.policy for e in expand([residual, same])][1:] == [same]
-    assert expand([residual, same])[0].member == Member(folder="one", training_seed=1, base="weak")
+    found = expand([residual, same])
+    assert (found[0].policy.name, found[0].policy.options) == (BEST_ON_THE_WALKER, same.options)
+    assert [e.policy for e in found][2:] == [same]
+    assert found[1].member == Member(folder="one", training_seed=1, base="weak", rival=BEST_ON_THE_WALKER)
     added = expand([other, residual])[1].policy
     assert (added.title, added.options) == ("input_output (base of residual:one)", same.options)
-    given_anew = expand([residual.replace(options={"stiffness_scale": 0.5})])[0].policy
-    assert given_anew.options == {"stiffness_scale": 0.5}
+    given_anew = expand([residual.replace(options={"stiffness_scale": 0.5})])
+    assert [e.policy.options for e in given_anew] == [{"stiffness_scale": 0.5}] * 3
+
+
+def test_the_best_policy_without_learning_is_the_one_that_the_user_names() -> None:
+    """Catches a rival that plays twice, one that assumes another stiffness, and a base that is its own rival."""
+    describe(Path("one"), 1)
+    residual = PolicySpec(name="residual:one")
+    tuned = PolicySpec(name=str(BEST_ON_THE_WALKER), label="tuned", options={"ramp_s": 2.0})
+    found = expand([residual, tuned])
+    assert [e.policy.title for e in found] == ["input_output", "residual:one", "tuned"]
+    assert found[1].member == Member(folder="one", training_seed=1, base="input_output", rival="tuned")
+    wrong = tuned.replace(label=BEST_ON_THE_WALKER, options={"stiffness_scale": 0.9})
+    added = expand([wrong, residual])[2].policy
+    assert (added.title, added.options) == (f"{BEST_ON_THE_WALKER} (best analytic)", {})
+    describe(Path("two"), 1, base=BEST_ON_THE_WALKER)
+    assert [e.member.rival for e in expand([PolicySpec(name="residual:two")]) if e.member] == [None]
 
 
 def test_shipped_policies_are_a_family_wherever_one_works() -> None:
@@ -214,7 +211,7 @@ def test_a_residual_that_is_called_like_its_base_is_not_taken_for_it() -> None:
     """Catches both under one title, whose episodes would then be averaged together."""
     describe(Path("one"), 1)
     titles = [entrant.policy.title for entrant in expand([PolicySpec(name="residual:one", label="input_output")])]
-    assert titles == ["input_output (base of input_output)", "input_output"]
+    assert titles == ["input_output (base of input_output)", BEST_ON_THE_WALKER, "input_output"]
 
 
 @pytest.mark.parametrize(
@@ -297,35 +294,6 @@ def test_a_residual_on_a_residual_is_refused() -> None:
 # Changes and their sentences.
 
 
-def cell(title: str, values: dict[str, Sequence[float | None]], scenario: str, member: Member | None = None,
-         reference: Any = 3, time: int = 400) -> Evaluation:  # fmt: skip
-    """A cell of the walker without physics: metrics, and a trace that any signal may be drawn from."""
-    spec = PolicySpec(name="zero" if member is None else f"residual:{member.folder}", label=title)
-    condition = Condition(env="walker", policy=spec, member=member, scenario=scenario, reference=reference)
-    episodes = [
-        {**record, "pelvis_error_rms_rad": value, "zmp_deviation_rms_m": value, "policy": title}
-        for key in values for record, value in zip(records(values[key]), values[key], strict=True)
-    ]  # fmt: skip
-    t = 0.004 * np.arange(time)
-    trace = {name: np.sin(t) for name in condition.environment.traced} | {
-        "time_s": t, "single_support": (t > 0.5).astype(float),
-    }  # fmt: skip
-    trace["zmp_y"] = np.where(t < 0.1, np.nan, trace["zmp_y"])
-    return Evaluation(condition, episodes, trace)
-
-
-def family(values: Sequence[Sequence[float | None]], scenario: str = "soft", **more: Any) -> list[Evaluation]:
-    """Cells of the training seeds of a residual, whose folders are made if they are not there."""
-    cells = []
-    for seed, own in enumerate(values):
-        folder = Path(f"seed_{seed}")
-        if not folder.exists():
-            describe(folder, seed)
-        member = Member(folder=str(folder), training_seed=seed, base="base")
-        cells.append(cell("learned", {"all": own}, scenario, member, **more))
-    return cells
-
-
 def only(rows: Sequence[Change], policy: str = "learned") -> Change:
     """The first row of a policy."""
     return next(row for row in rows if row.policy == policy)
@@ -344,6 +312,34 @@ def test_change_of_a_family_is_paired_per_training_seed() -> None:
     against = only(rows, "other")
     assert (against.base, against.is_family, against.relative) == ("base", False, Estimate(0.0))
     assert "no training seeds" in against.sentence
+
+
+def test_a_residual_is_compared_with_its_base_and_with_the_best_policy_without_learning() -> None:
+    """Catches a claim against the weaker of both alone, both under one heading, and the wrong one called its base."""
+    base, best = cell("base", {"all": [4.0, 4.0]}, "soft"), cell("best", {"all": [1.0, 1.0]}, "soft")
+    learned = [
+        Evaluation(e.condition.replace(member=e.condition.member.replace(rival="best")), e.episodes, e.trace)
+        for e in family([[2.0, 2.0]] * 5) if e.condition.member is not None
+    ]  # fmt: skip
+    evaluations = [base, best, *learned]
+    rows = [row for row in changes(evaluations) if row.policy == "learned" and row.column.metric == METRIC]
+    assert [(row.base, row.is_rival, row.relative.value) for row in rows] == [
+        ("base", False, -0.5), ("best", True, 1.0),
+    ]  # fmt: skip
+    page = report_of(evaluations)
+    sentence = (
+        "learned, pelvis error rms, soft (trained robot): 50 % lower than base, its base [−50, −50]; 100 % higher than "
+        "best, the best policy without learning [+100, +100]."
+    )
+    assert sentence in page
+    assert sentence in Path("runs/x/report.md").read_text()
+    headings = re.findall(r"<h2 id=\"s\d+\">([^<]*)</h2>", page)
+    assert headings[2:5] == ["Residuals against their base", "Residuals against the best policy without learning",
+                             "Baselines against one another"]  # fmt: skip
+    with write_statistics(changes(evaluations), Path("s.csv")).open(newline="") as file:
+        roles = {(row["policy"], row["base"]): row["base_is"] for row in csv.DictReader(file)}
+    assert roles["learned", "base"] == "base of the residual"
+    assert roles["learned", "best"] == "best policy without learning"
 
 
 SENTENCES: dict[str, tuple[Sequence[Sequence[float | None]], str]] = {

@@ -127,6 +127,10 @@ class Compare:
     Example, the paper's walks: elastic compare configs/paper.yaml
 
     Example, trained residuals: elastic compare configs/learned_testbed.yaml
+
+    Example, all policies in tracks by what they need: elastic compare configs/leaderboard.yaml
+
+    Example, heat maps over two axes: elastic compare configs/map_payload_slope.yaml
     """
 
     config: Annotated[Path, tyro.conf.Positional]

@@ -1,12 +1,17 @@
-"""Paired changes of a comparison: every residual against its base, and every baseline against the same base."""
+"""Paired changes of a comparison: every residual against its base and against the best policy without learning.
+
+Every baseline is compared with the base of the residuals, or without residuals with the first policy.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from elastic_env.core.signals import Array
+from elastic_env.runtime.scenario import make_scenario
+from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column, Environment, environment
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.families import Origin, origin
@@ -15,6 +20,8 @@ from train.evaluate.statistics import Estimate, change, improvement, over_seeds,
 CEILING, HELD_OUT, SAME_ROBOT = "ceiling on the training condition", "held out", "trained robot"
 """Scenario in which nothing is random: training and evaluation see the same; one that training never saw; one whose
 only robot is that of the training, so that evaluation differs by noise alone."""
+BEST_ANALYTIC = "best policy without learning"
+"""What a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
 """Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
 misses the truth, over five every eleventh."""
@@ -49,6 +56,7 @@ class Change:
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
+        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
     """
 
     policy: str
@@ -72,6 +80,7 @@ class Change:
     base_falls: int
     base_episodes: int
     failure: str
+    is_rival: bool = False
 
     @property
     def num_seeds(self) -> int:
@@ -186,7 +195,7 @@ def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
-    """All paired changes: residuals against their bases, baselines against these or, without residuals, the first.
+    """All paired changes: residuals against bases and rivals, baselines against bases or, without residuals, the first.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -194,14 +203,20 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
     """
     trained = families(evaluations)
     titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    bases = {e.condition.policy.title: e.condition.member.base for e in evaluations if e.condition.member}
-    default = list(dict.fromkeys(bases.values())) or titles[:1]
+    members = {e.condition.policy.title: e.condition.member for e in evaluations if e.condition.member}
+    default = list(dict.fromkeys(member.base for member in members.values())) or titles[:1]
     rows = []
     for title in titles:
         own = [e for e in evaluations if e.condition.policy.title == title]
-        for base in [bases[title]] if title in bases else [base for base in default if base != title]:
+        member = members.get(title)
+        opponents = [base for base in default if base != title] if member is None else [member.base]
+        if member is not None and member.rival is not None:
+            opponents.append(member.rival)
+        for base in opponents:
             theirs = [e for e in evaluations if e.condition.policy.title == base]
-            rows += _against(own, theirs, trained.get(title), groups or {})
+            found = _against(own, theirs, trained.get(title), groups or {})
+            is_rival = member is not None and base == member.rival
+            rows += [replace(row, is_rival=True) for row in found] if is_rival else found
     return rows
 
 
@@ -247,34 +262,42 @@ def _against(own: Sequence[Evaluation], base: Sequence[Evaluation], trained: Ori
 def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]], trained: Origin | None, is_group: bool
           ) -> list[Change]:  # fmt: skip
     """A row per judged column, over one scenario or several."""
-    first, base = cells[0][0][0].condition, cells[0][1][0].condition
-    scenarios = [ours[0].condition.scenario for ours, _ in cells]
+    first = cells[0][0][0].condition
     known = first.environment
+    scenarios = [_seen_as(ours[0].condition, trained) for ours, _ in cells]
+    marks = _marks(trained, _motion(known, first.reference), scenarios, first.swept)
+    return [_row(scope, cells, column, marks, is_group) for column in (*known.judged, *known.also)]
+
+
+def paired(own: list[Evaluation], base: list[Evaluation], column: Column) -> Change:
+    """A policy against another one in one cell and metric; without marks."""
+    return _row(own[0].condition.scenario, [(own, base)], column, (), is_group=False)
+
+
+def _row(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]], column: Column,
+         marks: tuple[str, ...], is_group: bool) -> Change:  # fmt: skip
+    """The change of one metric, over one scenario or several."""
+    first, base = cells[0][0][0].condition, cells[0][1][0].condition
     mine = [e for ours, _ in cells for e in ours]
     theirs = [e for _, others in cells for e in others]
-    marks = _marks(trained, _motion(known, first.reference), scenarios, first.swept)
-    rows = []
-    for column in (*known.judged, *known.also):
-        seeds = [
-            [pair(ours[number].episodes, others[0].episodes, column.metric) for ours, others in cells]
-            for number in range(len(cells[0][0]))
-        ]
-        per_seed = np.array([change(pairs) for pairs in seeds])
-        rows.append(
-            Change(
-                policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
-                reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
-                marks=marks, column=column, is_judged=column in known.judged,
-                per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
-                mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
-                theirs=_mean([[p.base for p in pairs] for pairs in seeds]),
-                num_pairs=sum(len(p) for pairs in seeds for p in pairs),
-                falls=sum(e.num_failed for e in mine), episodes=sum(len(e.episodes) for e in mine),
-                base_falls=sum(e.num_failed for e in theirs), base_episodes=sum(len(e.episodes) for e in theirs),
-                failure=known.failures,
-            )
-        )  # fmt: skip
-    return rows
+    known = first.environment
+    seeds = [
+        [pair(ours[number].episodes, others[0].episodes, column.metric) for ours, others in cells]
+        for number in range(len(cells[0][0]))
+    ]
+    per_seed = np.array([change(pairs) for pairs in seeds])
+    return Change(
+        policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
+        reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
+        marks=marks, column=column, is_judged=column in known.judged,
+        per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
+        mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
+        theirs=_mean([[p.base for p in pairs] for pairs in seeds]),
+        num_pairs=sum(len(p) for pairs in seeds for p in pairs),
+        falls=sum(e.num_failed for e in mine), episodes=sum(len(e.episodes) for e in mine),
+        base_falls=sum(e.num_failed for e in theirs), base_episodes=sum(len(e.episodes) for e in theirs),
+        failure=known.failures,
+    )  # fmt: skip
 
 
 def _mean(seeds: Sequence[Sequence[Array]]) -> float:
@@ -308,6 +331,16 @@ def _marks(
     same = [scenario for scenario in scenarios if known.differs_by_noise_alone(scenario, motion)]
     named = f": {', '.join(same)}" if len(same) < len(scenarios) else ""
     return (f"{SAME_ROBOT}{named}",) if same else ()
+
+
+def _seen_as(condition: Condition, trained: Origin | None) -> str:
+    """The scenario of a condition; one whose fields are varied by the name under which training has seen the same."""
+    played = condition.scenario_played
+    if isinstance(played, str):
+        return played
+    seen = trained.scenarios if trained is not None and trained.scenarios is not None else ()
+    same = (name for name in seen if make_scenario(name).replace(name="") == played.replace(name=""))
+    return next(same, f"varied {condition.scenario}")
 
 
 def _motion(known: Environment, reference: Any) -> str:

@@ -1,16 +1,22 @@
 """Cells of a comparison: which policy plays which motion in which environment, as configurations say it."""
 
+from collections.abc import Mapping
+from functools import lru_cache
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, field_validator
 
-from baselines.policies import sensors_needed
+from baselines.catalogue import Track
+from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.errors import shown
+from elastic_env.runtime.scenario import Scenario, make_scenario
 from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
 
 MOST_EPISODES = 100_000
 """Episodes of a cell."""
+SCENARIO = "scenario."
+"""What stands before a field of the scenario that is varied, such as scenario.stiffness_scale."""
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
@@ -53,6 +59,8 @@ class PolicySpec(Model):
     """Arguments of the environment for this policy alone, such as form: rigid."""
     level: bool = False
     """In a sweep: whether it plays once without the swept option, as a level to compare with."""
+    track: Track | None = None
+    """On a leaderboard: what it needs; None for what is known of it, and of one's own policy the standard sensors."""
 
     _checked = field_validator("env_options")(_options)
 
@@ -71,6 +79,9 @@ class Member(Model):
     """Seed that it was trained with; None where nothing says it."""
     base: str
     """Title of the policy that it corrects."""
+    rival: str | None = None
+    """Title of the best policy without learning and with the standard sensors; None where that is the base, or nobody
+    plays it."""
 
 
 class Condition(Model):
@@ -89,7 +100,7 @@ class Condition(Model):
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
     swept: dict[str, float] = {}
-    """The policy's option that a sweep varies, and its value here."""
+    """What is varied, and its value here: an option of the policy, or with `SCENARIO` before it one of the scenario."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
     seed: int = quantity(
         "1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode; the next ones follow"
@@ -119,11 +130,54 @@ class Condition(Model):
         The environment also has the sensors that a baseline reads.
         """
         motion = self.environment.arguments(self.reference)
-        found = {"scenario": self.scenario, **self.env_options, **self.policy.env_options, **motion}
+        found = {"scenario": self.scenario_played, **self.env_options, **self.policy.env_options, **motion}
         needed = sensors_needed(self.policy.name)
         return {**found, "sensors": [*dict.fromkeys([*found.get("sensors", ()), *needed])]} if needed else found
 
     @property
+    def scenario_played(self) -> str | Scenario:
+        """The scenario with the fields that are varied; its name where none is."""
+        fields = {name: value for name, value in self.swept.items() if name.startswith(SCENARIO)}
+        return varied(make_scenario(self.scenario), fields) if fields else self.scenario
+
+    @property
     def policy_options(self) -> dict[str, Any]:
         """Options of the policy with the swept one."""
-        return {**self.policy.options, **self.swept}
+        swept = {name: value for name, value in self.swept.items() if not name.startswith(SCENARIO)}
+        return {**self.policy.options, **swept}
+
+    @property
+    def track(self) -> Track:
+        """What the policy needs: as its specification says it, or its name."""
+        return self.policy.track or track(self.policy.name, self.environment.walks)
+
+
+def varied(scenario: Scenario, fields: Mapping[str, float]) -> Scenario:
+    """A scenario with other values of some fields, such as {"scenario.pelvis_imu.bias_spread_rad": 0.002} [SI].
+
+    Raises:
+        ConfigurationError: A value is beyond the bounds of its field.
+    """
+    for path, value in fields.items():
+        first, _, inner = path.removeprefix(SCENARIO).partition(".")
+        new = getattr(scenario, first).replace(**{inner: value}) if inner else value
+        scenario = scenario.replace(**{first: new})
+    return scenario
+
+
+@lru_cache(maxsize=1)
+def scenario_fields() -> Mapping[str, tuple[str, str]]:
+    """Numbers of a scenario that can be varied: description and unit, by name with `SCENARIO` before it."""
+    return _numbers_of(Scenario, SCENARIO)
+
+
+def _numbers_of(model: type[Model], before: str) -> dict[str, tuple[str, str]]:
+    found: dict[str, tuple[str, str]] = {}
+    for name, field in model.model_fields.items():
+        extra = field.json_schema_extra
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Model):
+            found |= _numbers_of(field.annotation, f"{before}{name}.")
+        elif isinstance(extra, dict):
+            unit = str(extra["unit"])
+            found[f"{before}{name}"] = (field.description or name).removesuffix(f" [{unit}]"), unit
+    return found

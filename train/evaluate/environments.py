@@ -112,6 +112,7 @@ class Environment:
         quantity: What a reference is, in titles; empty where its label says it.
         failure: Heading for episodes that end before their time.
         is_real: Whether it is hardware: one world at a time, in this process, without a truth to score by.
+        walks: Whether its policies are those of the walker.
     """
 
     id: str
@@ -136,6 +137,7 @@ class Environment:
     quantity: str = ""
     failure: str = "fail"
     is_real: bool = False
+    walks: bool = False
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """Whether all episodes of a condition are one and the same."""
@@ -320,6 +322,7 @@ _WALKER = Environment(
     ),
     quantity="step period",
     failure="falls",
+    walks=True,
 )  # fmt: skip
 
 _HARDWARE = replace(

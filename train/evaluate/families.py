@@ -1,4 +1,7 @@
-"""Policies of a comparison with all training seeds of a residual, and with the base that each residual belongs to."""
+"""Policies of a comparison with all training seeds of a residual, and with whom each residual is compared.
+
+A residual is compared with its base, and with the best policy without learning that reads the same sensors.
+"""
 
 import difflib
 import fnmatch
@@ -7,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from baselines.policies import RESIDUAL
+from baselines.catalogue import ASSUMED_OPTIONS
+from baselines.policies import RESIDUAL, best_analytic
 from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.conditions import Member, PolicySpec
@@ -54,11 +58,11 @@ class Origin:
 
 
 def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
-    """All who play: a residual's pattern as one entrant per folder, and bases that nobody named.
+    """All who play: a residual's pattern as one entrant per folder, and bases and rivals that nobody named.
 
     Args:
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
-        with_bases: Whether a base that is not among them is added, before its residual.
+        with_bases: Whether a base or a rival that is not among them is added, before its residual.
 
     Raises:
         ConfigurationError: A pattern that matches no folder, a folder without residual, or folders that do not belong
@@ -80,10 +84,15 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
             if with_bases:
                 bases.append(base)
                 entrants.append(Entrant(base))
+        rival = _rival(description, policy, [*policies, *bases])
+        if rival is not None and with_bases and rival not in bases:
+            bases.append(rival)
+            entrants.append(Entrant(rival))
+        others = None if rival is None or rival not in bases else rival.title
         entrants += [
             Entrant(
                 policy.replace(name=f"{RESIDUAL}{folder}", label=policy.title),
-                Member(folder=str(folder), training_seed=seed, base=base.title),
+                Member(folder=str(folder), training_seed=seed, base=base.title, rival=others),
             )
             for folder, seed, _ in members
         ]
@@ -207,6 +216,28 @@ def _base(description: ResidualDescription, residual: PolicySpec, taken: Sequenc
     label = None if description.base not in titles else f"{description.base} (base of {residual.title})"
     return PolicySpec(
         name=description.base, label=label, options=_base_options(description, residual),
+        env_options=residual.env_options, level=residual.level,
+    )  # fmt: skip
+
+
+def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
+    """The best policy without learning, with the same sensors, in the same environment; None where that is the base.
+
+    One that is among the policies counts if it assumes the same stiffness, whatever its other options.
+    """
+    known = ENVIRONMENTS.get(description.robot)
+    name = best_analytic(known is not None and known.walks)
+    if name is None or name == description.base:
+        return None
+    assumed = {o: v for o, v in _base_options(description, residual).items() if o in ASSUMED_OPTIONS}
+    for policy in taken:
+        mine = {option: value for option, value in _given(policy.options).items() if option in ASSUMED_OPTIONS}
+        same = policy.env_options == residual.env_options and policy.level == residual.level
+        if policy.name == name and mine == assumed and same:
+            return policy
+    titles = {policy.title for policy in taken}
+    return PolicySpec(
+        name=name, label=f"{name} (best analytic)" if name in titles else None, options=assumed,
         env_options=residual.env_options, level=residual.level,
     )  # fmt: skip
 

@@ -16,10 +16,14 @@ from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, 
 from train.evaluate.environments import Environment, Reference, environment
 from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
 from train.evaluate.families import expand
+from train.evaluate.leaderboard import standings
+from train.evaluate.maps import MapConfig, heat_maps
+from train.experiments.timing import step_times
 from train.figures import plots
-from train.figures.figures import draw_figures
+from train.figures.figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
-from train.report.changes_tables import print_changes, write_statistics
+from train.report.changes_tables import print_changes, write_maps, write_statistics
+from train.report.leaderboard import write_leaderboard
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
@@ -61,14 +65,23 @@ class CompareConfig(Model):
     """Policies that the time series show, by label or name; all if empty."""
     sweep: Sweep | None = None
     """An option of the policies to vary."""
+    map: MapConfig | None = None
+    """Two axes to vary, for heat maps: fields of the scenario, or the motion, whose values are then the references."""
     groups: dict[str, list[str]] = {}
     """Scenarios that paired changes are also pooled over, by the name of the group."""
+    reference_scenarios: dict[str, list[Title]] = {}
+    """Scenarios of single references, by their names in tables, where not all are played: {24 s: [nominal]}."""
+    leaderboard: bool = False
+    """Whether a leaderboard is written: policies in tracks, groups and motions as columns, and the time of a step."""
 
     @model_validator(mode="before")
     @classmethod
     def _environment_has_a_default(cls, values: Any) -> Any:
         name = values.get("env", "testbed") if isinstance(values, dict) else None
-        return {"references": [environment(name).default_reference], **values} if isinstance(name, str) else values
+        if not isinstance(name, str):
+            return values
+        known = environment(name)
+        return {"references": _along(values.get("map"), known) or [known.default_reference], **values}
 
     _kind = model_validator(mode="before")(is_a("comparison"))  # the last one runs first
 
@@ -88,6 +101,7 @@ class CompareConfig(Model):
                 raise ConfigurationError(f"two policies are called {title!r}; give one of them a label")
         if self.sweep is not None and all(policy.level for policy in self.policies):
             raise ConfigurationError("a sweep needs a policy that it varies; level: true leaves all of them out of it")
+        self._require_map()
         _require_each_once("reference", self._reference_names())
         _require_each_once("scenario", self.scenarios)
         _require_each_once("value of the sweep", self.sweep.values if self.sweep else [])
@@ -101,6 +115,7 @@ class CompareConfig(Model):
                 raise ConfigurationError(
                     f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got {shown(episodes)}"
                 )
+        self._require_reference_scenarios()
         for name, scenarios in self.groups.items():
             if name in self.scenarios or not scenarios or len(set(scenarios)) < len(scenarios):
                 raise ConfigurationError(
@@ -112,6 +127,33 @@ class CompareConfig(Model):
                     raise unknown_name(f"scenario of the group {name!r}", scenario, self.scenarios)
         return self
 
+    def _require_reference_scenarios(self) -> None:
+        """Refuse scenarios of references that are not played, and a leaderboard of what none can be of."""
+        for name, scenarios in self.reference_scenarios.items():
+            if name not in self._reference_names():
+                raise unknown_name("reference with scenarios of its own", name, self._reference_names())
+            if not scenarios:
+                raise ConfigurationError(f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}")
+            _require_each_once(f"scenario of {name!r}", scenarios)
+            for scenario in scenarios:
+                if scenario not in self.scenarios:
+                    raise unknown_name(f"scenario of {name!r}", scenario, self.scenarios)
+        if self.leaderboard and (self.sweep is not None or self.map is not None or environment(self.env).is_real):
+            raise ConfigurationError("a leaderboard is of simulated cells without a sweep or a map; leave these out")
+
+    def _require_map(self) -> None:
+        """Refuse a map that its environment does not have, or that something else of the comparison contradicts."""
+        if self.map is None:
+            return
+        self.map.require(environment(self.env))
+        if self.sweep is not None or any(policy.level for policy in self.policies):
+            raise ConfigurationError("a map has two axes of its own; leave out sweep, and level of the policies")
+        if self.map.motion is not None and self.references != self.map.motion.values:
+            raise ConfigurationError(
+                f"an axis of the map varies the {self.map.motion.what}, so its values are the references; "
+                f"leave out references, got {shown(self.references)}"
+            )
+
     def conditions(self, with_bases: bool = True) -> list[Condition]:
         """All cells, in the order reference, scenario, policy, training seed, swept value.
 
@@ -122,8 +164,10 @@ class CompareConfig(Model):
             ConfigurationError: Residuals that do not exist, or are no family.
         """
         entrants = expand(self.policies, with_bases)
-        swept = len(self.sweep.values) if self.sweep else 1
-        cells = len(self.references) * len(self.scenarios) * len(entrants) * swept
+        swept = len(self.sweep.values) if self.sweep else len(self.map.coordinates()) if self.map else 1
+        own = self.reference_scenarios
+        played = {name: own.get(name, self.scenarios) for name in self._reference_names()}
+        cells = sum(map(len, played.values())) * len(entrants) * swept
         if cells > _MOST_CELLS:
             raise ConfigurationError(
                 f"a comparison must have at most {_MOST_CELLS} cells, {len(self.references)} references x "
@@ -136,13 +180,17 @@ class CompareConfig(Model):
                 env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
-            for reference, label in zip(self.references, self._reference_labels(), strict=True)
-            for scenario in self.scenarios
+            for reference, label, scenarios in zip(
+                self.references, self._reference_labels(), played.values(), strict=True
+            )
+            for scenario in scenarios
             for entrant in entrants
             for swept in self._swept(entrant.policy)
         ]  # fmt: skip
 
     def _swept(self, policy: PolicySpec) -> list[dict[str, float]]:
+        if self.map is not None:
+            return self.map.coordinates()
         if self.sweep is None or policy.level:
             return [{}]
         return [{self.sweep.option: value} for value in self.sweep.values]
@@ -209,11 +257,19 @@ def compare(
         cells = merged(evaluations)
         files.append(write_summary(cells, folder / "summary.md"))
         axis = None if config.sweep is None else config.sweep.label or config.sweep.option
-        files += draw_figures(cells, folder, config.figure_policies, axis)
+        maps = [] if config.map is None else heat_maps(evaluations, config.map)
+        files += draw_maps(maps, folder) if maps else draw_figures(cells, folder, config.figure_policies, axis)
+        if maps:
+            files.append(write_maps(maps, folder / "map.csv"))
         rows = changes(evaluations, config.groups) if report else []
+        board = []
+        if config.leaderboard:
+            console.print("measuring the time of every policy, in turn")
+            board = standings(evaluations, rows, config.groups, step_times(conditions))
+            files += write_leaderboard(board, folder)
         if report:
             files.append(write_statistics(rows, folder / "statistics.csv"))
-            files += write_report(Results(config.name, evaluations, rows, folder, axis))
+            files += write_report(Results(config.name, evaluations, rows, folder, axis, maps, board))
     print_summary(cells, console)
     print_changes(rows, console)
     return Comparison(folder, evaluations, files)
@@ -238,6 +294,13 @@ def try_out(conditions: Sequence[Condition]) -> None:
             raise ConfigurationError(
                 f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
             )
+
+
+def _along(axes: Any, known: Environment) -> list[Any]:
+    """Values of the axis of a raw map that varies the motion; empty where none does."""
+    found = [axis for axis in axes.values() if isinstance(axis, dict)] if isinstance(axes, dict) else []
+    along = [axis["values"] for axis in found if axis.get("what") == known.motion and "values" in axis]
+    return along[0] if along and isinstance(along[0], list) else []
 
 
 def _parameters(reference: Reference, known: Environment) -> list[str]:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from train.evaluate.environments import Environment
 from train.evaluate.evaluate import Evaluation, make_vector_env
+from train.evaluate.maps import HeatMap
+from train.figures.map_plots import draw_map
 from train.figures.plots import draw_overview
 from train.figures.sweep_plots import Curve, draw_sweep
 from train.figures.testbed_plots import draw_static_errors, draw_time_series
@@ -39,6 +41,11 @@ def draw_figures(
         for name in known.figures:
             files += draw_figure(name, shown, folder)
     return files
+
+
+def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
+    """Draw the maps of a comparison, a picture per scenario, motion and metric."""
+    return [draw_map(found, folder / f"map_{_safe(f'{found.title}_{found.column.metric}')}.png") for found in maps]
 
 
 def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
@@ -83,9 +90,7 @@ def reference_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
 
 
 def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment, folder: Path) -> list[Path]:
-    if not has_swept_references(evaluations):
-        return []
-    scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
+    scenarios = swept_scenarios(evaluations)
     return [
         draw_sweep(
             reference_curves([e for e in evaluations if e.condition.scenario == scenario]), f"{known.quantity} [s]",
@@ -121,6 +126,14 @@ _FIGURES: dict[str, Draw] = {
     "pelvis": draw_pelvis,
     "zmp": draw_zmp,
 }
+
+
+def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
+    """Scenarios in which the references that are played are points of one axis."""
+    found: dict[str, list[Evaluation]] = {}
+    for e in evaluations:
+        found.setdefault(e.condition.scenario, []).append(e)
+    return [scenario for scenario, own in found.items() if has_swept_references(own)]
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:

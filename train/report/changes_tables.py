@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from train.evaluate.changes import CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
+from train.evaluate.changes import BEST_ANALYTIC, CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
+from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate
 from train.runs.escaping import csv_row
 
@@ -26,7 +27,33 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
     return path
 
 
-_HEAD = ("policy", "base", "kind", "reference", "scope", "pooled", "marks")
+def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
+    """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as they are shown."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(_MAP_HEAD)
+        for found in maps:
+            ticks = found.x.ticks(found.known), found.y.ticks(found.known)
+            for y, row in zip(ticks[1], found.cells, strict=True):
+                for x, cell in zip(ticks[0], row, strict=True):
+                    for title, estimate in cell.levels.items():
+                        change = cell.learned.get(title)
+                        against = ("",) * 4 if change is None else (*_cells(change.relative), change.verdict)
+                        own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
+                        marks = [title == cell.best, title == cell.best_analytic]
+                        writer.writerow(
+                            csv_row(
+                                [*own, *_cells(estimate), *cell.failed[title], *marks, cell.best_analytic, *against]
+                            )
+                        )
+    return path
+
+
+_MAP_HEAD = (
+    "map", "x_is", "x", "y_is", "y", "metric", "policy", "mean", "mean_low", "mean_high", "failed", "episodes",
+    "is_best", "is_best_without_learning", "best_without_learning", "change", "change_low", "change_high", "verdict",
+)  # fmt: skip
+_HEAD = ("policy", "base", "base_is", "kind", "reference", "scope", "pooled", "marks")
 _FIGURES = (
     "metric", "base_mean", "mean", "change", "change_low", "change_high", "improvement", "improvement_low",
     "improvement_high", "training_seeds", "pairs", "failed", "episodes", "base_failed", "base_episodes",
@@ -36,11 +63,17 @@ _FIGURES = (
 
 def _record(row: Change, swept: Sequence[str]) -> list[object]:
     return [
-        row.policy, row.base, "residual" if row.is_family else "baseline", row.reference, row.scope, row.is_group,
-        "; ".join(row.marks), *(row.swept.get(name, "") for name in swept), row.column.metric, row.theirs, row.mine,
+        row.policy, row.base, _role(row), "residual" if row.is_family else "baseline", row.reference, row.scope,
+        row.is_group, "; ".join(row.marks), *(row.swept.get(name, "") for name in swept), row.column.metric,
+        row.theirs, row.mine,
         *_cells(row.relative), *_cells(row.improvement), row.num_seeds, row.num_pairs, row.falls, row.episodes,
         row.base_falls, row.base_episodes, " ".join(f"{value:.6g}" for value in row.per_seed), row.sentence,
     ]  # fmt: skip
+
+
+def _role(row: Change) -> str:
+    """What the other policy of a row is."""
+    return BEST_ANALYTIC if row.is_rival else "base of the residual" if row.is_family else "policy to compare with"
 
 
 def _cells(estimate: Estimate) -> tuple[object, object, object]:
@@ -49,18 +82,18 @@ def _cells(estimate: Estimate) -> tuple[object, object, object]:
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell; nothing without residuals."""
-    shown = [row for row in rows if row.is_family and row.is_judged]
-    if not shown:
-        return
-    console.print(changes_table(shown))
+    """Print the changes of the residuals, a line per cell; first against bases, then against rivals."""
+    for is_rival in (False, True):
+        shown = [row for row in rows if row.is_family and row.is_judged and row.is_rival == is_rival]
+        if shown:
+            console.print(changes_table(shown))
 
 
 def changes_table(rows: Sequence[Change]) -> Table:
-    """Changes of residuals against their bases, a line per cell with all judged metrics.
+    """Changes of residuals against their bases, or against their rivals, a line per cell with all judged metrics.
 
     Args:
-        rows: Changes of families, of one environment.
+        rows: Changes of families, of one environment, all against bases or all against rivals.
     """
     columns = list(dict.fromkeys(row.column for row in rows))
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
@@ -74,7 +107,7 @@ def changes_table(rows: Sequence[Change]) -> Table:
     named = ["residual"] if len(policies) > 1 else []  # else the title names it, which leaves room
     whose = "" if named else f"{escape(policies[0])}: "
     table = Table(
-        title=f"{whose}change against the base on the same episodes, {over}",
+        title=f"{whose}change against {_opponent(rows)} on the same episodes, {over}",
         caption=", ".join([*signs, "* an interval that includes zero, or too few training seeds: no difference shown"]),
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
     )  # fmt: skip
@@ -82,7 +115,8 @@ def changes_table(rows: Sequence[Change]) -> Table:
         table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold")
     for column in columns:
         table.add_column(column.title, justify="right", no_wrap=True, vertical="bottom")
-    table.add_column(f"{rows[0].failure}\n(base)", justify="right", no_wrap=True, vertical="bottom")
+    other = "other" if rows[0].is_rival else "base"
+    table.add_column(f"{rows[0].failure}\n({other})", justify="right", no_wrap=True, vertical="bottom")
     previous: tuple[str, ...] = ()
     for line in by_line(rows):
         first = line[0]
@@ -99,6 +133,13 @@ def changes_table(rows: Sequence[Change]) -> Table:
             style="bold" if first.is_group else "",
         )  # fmt: skip
     return table
+
+
+def _opponent(rows: Sequence[Change]) -> str:
+    """Whom a table compares residuals with."""
+    if not rows[0].is_rival:
+        return "the base"
+    return f"{escape(', '.join(dict.fromkeys(row.base for row in rows)))} ({BEST_ANALYTIC})"
 
 
 _SIGNS = {HELD_OUT: "°", CEILING: "†", SAME_ROBOT: "‡"}

@@ -4,8 +4,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from train.evaluate.changes import Change, by_line, percent_interval
+from train.evaluate.changes import BEST_ANALYTIC, Change, by_line, percent_interval
+from train.figures.map_plots import in_rows, panels
 from train.report.changes_tables import falls
+from train.report.leaderboard import leaderboard_markdown
 from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
 from train.runs.escaping import markdown_table, markdown_text
 
@@ -17,8 +19,17 @@ def markdown(results: Results) -> str:
         _bullets(f"{term}: {text}" for term, text in what(results)),
     ]
     parts += ["## In short", _bullets(in_short(results))]
+    if results.standings:
+        parts += ["## Leaderboard", leaderboard_markdown(results.standings).rstrip()]
+    for heat_map in results.maps:
+        parts.append(f"## Map: {markdown_text(f'{heat_map.column.title}, {heat_map.title}')}")
+        for panel in panels(heat_map):
+            key = ", ".join(f"{letter} {title}" for letter, title, _ in panel.key)
+            head, rows = in_rows(panel)
+            parts += [markdown_text(f"{panel.title}{key and f' ({key})'}:"), _markdown_table(head, rows, words=1)]
     for title, rows in (
-        ("Residuals against their base", [row for row in results.changes if row.is_family]),
+        ("Residuals against their base", [row for row in results.changes if row.is_family and not row.is_rival]),
+        (f"Residuals against the {BEST_ANALYTIC}", [row for row in results.changes if row.is_rival]),
         ("Baselines against one another", [row for row in results.changes if not row.is_family]),
     ):
         if rows:

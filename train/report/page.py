@@ -14,7 +14,7 @@ from train.runs.escaping import script_json
 if TYPE_CHECKING:
     from jinja2 import Template
 
-Kind = Literal["heading", "bullets", "definitions", "table", "changes", "chart"]
+Kind = Literal["heading", "bullets", "definitions", "table", "changes", "chart", "map", "board", "text"]
 
 
 class Page:

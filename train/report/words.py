@@ -7,7 +7,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from train.evaluate.changes import (
+    BEST_ANALYTIC,
     CEILING,
     FEWEST_SEEDS,
     HELD_OUT,
@@ -16,11 +19,14 @@ from train.evaluate.changes import (
     by_cell,
     families,
     level,
+    percent,
     percent_interval,
 )
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.families import Origin
+from train.evaluate.leaderboard import Standing
+from train.evaluate.maps import HeatMap
 from train.evaluate.progress import Curves, learning_curves
 from train.report.parts import Lines, number_interval
 
@@ -41,6 +47,8 @@ class Results:
         changes: Paired changes.
         folder: Where the comparison's files are, with its metadata.
         swept: What the axis of a sweep says; None without one.
+        maps: Heat maps over two axes, where such are wanted.
+        standings: Rows of the leaderboard, where one is wanted.
     """
 
     name: str
@@ -48,6 +56,8 @@ class Results:
     changes: list[Change]
     folder: Path
     swept: str | None = None
+    maps: Sequence[HeatMap] = ()
+    standings: Sequence[Standing] = ()
 
     @cached_property
     def families(self) -> dict[str, Origin]:
@@ -70,6 +80,11 @@ class Results:
     def metadata(self) -> Mapping[str, Any]:
         """Origin of the comparison: date, seed, commit, versions."""
         return json.loads((self.folder / "metadata.json").read_text(encoding="utf-8"))
+
+    @property
+    def has_conditions(self) -> bool:
+        """Whether its cells are conditions of their own, and not points of a curve or a map."""
+        return self.swept is None and not self.maps
 
     @property
     def swept_options(self) -> list[str]:
@@ -106,26 +121,98 @@ def _trained(origin: Origin) -> str:
 
 
 def in_short(results: Results) -> list[str]:
-    """A line per residual and metric: in how many cells it is better, worse, or neither."""
-    found = []
+    """What learning adds in a sentence each; then per residual and metric in how many cells it is better, or worse."""
+    found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)] + claims(results)
     for title in results.families:
-        rows = [row for row in results.changes if row.policy == title and row.is_judged]
-        for column in dict.fromkeys(row.column for row in rows):
-            own = [row for row in rows if row.column == column]
-            found += [
-                f"{title} against {row.base}, {column.title}, pooled over {row.scope}{_at(results, row)}: "
-                f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
-                for row in own
-                if row.is_group
-            ]
-            cells = [row for row in own if not row.is_group]
-            if cells:
-                found.append(f"{title} against {cells[0].base}, {column.title}: {_tally(cells)}.")
-        worse = [row for row in rows if row.falls_more and not row.is_group]
-        if worse:
-            where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
-            found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
+        for is_rival in (False, True):
+            rows = [r for r in results.changes if r.policy == title and r.is_judged and r.is_rival == is_rival]
+            for column in dict.fromkeys(row.column for row in rows):
+                found += _of_a_metric(results, [row for row in rows if row.column == column])
+            worse = [row for row in rows if row.falls_more and not row.is_group]
+            if worse:
+                where = ", ".join(dict.fromkeys(f"{row.scope}{_at(results, row)}" for row in worse))
+                found.append(f"{title}: more {worse[0].failure} than {worse[0].base} in {where}.")
     return found or ["No residual takes part: there are no training seeds, and differences are differences of means."]
+
+
+def of_a_map(heat_map: HeatMap) -> list[str]:
+    """Who is best in how many cells of a map, and where learning is ahead of the best policy without it."""
+    where, cells = f"{heat_map.column.title}, {heat_map.title}", heat_map.flat
+    wins = {title: sum(cell.best == title for cell in cells) for title in heat_map.policies}
+    ranking = sorted((title for title in wins if wins[title]), key=lambda title: -wins[title])
+    found = [
+        f"{where}: best of {len(cells)} cells: " + ", ".join(f"{title} in {wins[title]}" for title in ranking) + "."
+    ]
+    for title in heat_map.families:
+        rows = [cell.learned[title] for cell in cells if title in cell.learned]
+        values = [row.relative.value for row in rows if np.isfinite(row.relative.value)]
+        if values:
+            span = f"from {percent(min(values))} to {percent(max(values))}"
+            found.append(f"{where}: {title} against the {BEST_ANALYTIC} of each cell: {_tally(rows)}; {span}.")
+    return found
+
+
+def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
+    """Lines of a residual in one metric against one other policy: pooled figures, and in how many cells what holds."""
+    found = [
+        f"{row.policy} against {row.base}, {row.column.title}, pooled over {row.scope}{_at(results, row)}: "
+        f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
+        for row in own
+        if row.is_group and not any(c.is_rival and c.policy == row.policy for c in results.changes)
+    ]
+    cells = [row for row in own if not row.is_group]
+    if cells:
+        found.append(f"{cells[0].policy} against {cells[0].base}, {cells[0].column.title}: {_tally(cells)}.")
+    return found
+
+
+def claims(results: Results) -> list[str]:
+    """What learning adds to the base of a residual, and to the best policy without learning: a sentence per scope.
+
+    Scopes are the groups; without groups the scenarios, where there are few.
+    """
+    judged = [row for row in results.changes if row.is_family and row.is_judged]
+    rivals = [row for row in judged if row.is_rival]
+    pooled = [row for row in rivals if row.is_group]
+    few = len({(row.policy, row.reference, row.scope, *row.swept.items()) for row in rivals}) <= _MOST_CLAIMS
+    found = []
+    for rival in pooled or (rivals if few else []):
+        base = next(
+            row for row in judged
+            if not row.is_rival
+            and (row.policy, row.reference, row.scope, row.is_group, row.swept, row.column)
+            == (rival.policy, rival.reference, rival.scope, rival.is_group, rival.swept, rival.column)
+        )  # fmt: skip
+        where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
+        found.append(
+            f"{rival.policy}, {rival.column.title}, {where}{marked(rival)}: {_compared(base)} than {base.base}, its "
+            f"base{_bounds(base)}; {_compared(rival)} than {rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}."
+        )
+    return found
+
+
+_MOST_CLAIMS = 4
+"""Scopes and metrics of which each has a sentence, without groups."""
+
+
+def _bounds(row: Change) -> str:
+    """The interval of a change."""
+    text = percent_interval(row.relative)
+    return text[text.index(" [") :] if row.relative.has_interval else ""
+
+
+def _compared(row: Change) -> str:
+    """How much lower or higher, before "than"."""
+    value = row.relative.value
+    if not np.isfinite(value):
+        return "not comparable (no episode in which both stayed up), neither lower nor higher"
+    size = f"{percent(abs(value), signed=False)} {'higher' if value > 0.0 else 'lower'}"
+    return {
+        "lower": size,
+        "higher": size,
+        "none": "not shown to be lower or higher",
+        "unclear": f"{size} (too few training seeds to tell)",
+    }[row.verdict]
 
 
 def _besides(row: Change) -> str:
@@ -175,6 +262,18 @@ def notes(results: Results) -> list[str]:
         notes.append(
             "Better than base: share of all pairs of training seed and episode in which the residual is ahead, ties "
             "as one half."
+        )
+    if results.maps:
+        notes.append(
+            f"The {BEST_ANALYTIC} of a cell is the one with the lowest mean on that cell's episodes, among those that "
+            "read the standard sensors. It is chosen after the fact, which favours it. Failures count before scores: "
+            "who fails less often is the better one. A star: not told from chance, or too few training seeds."
+        )
+    if any(row.is_rival for row in results.changes):
+        notes.append(
+            f"The {BEST_ANALYTIC} reads the same sensors as the residual (encoders, foot sensors and IMU). The change "
+            "against the base says what learning adds to that compensator; the change against this policy says what it "
+            "adds to good practice."
         )
     marks = {mark for row in results.changes for mark in row.marks}
     if any(mark.startswith(HELD_OUT) for mark in marks):

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
-from train.evaluate.changes import by_line
+from train.evaluate.changes import BEST_ANALYTIC, by_line
 from train.evaluate.evaluate import Evaluation
-from train.figures.figures import has_swept_references
+from train.figures.figures import swept_scenarios
+from train.figures.map_plots import panels
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
+from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
@@ -44,13 +46,16 @@ def _page(results: Results) -> Page:
     page.section("What was compared")
     page.add("definitions", what(results))
     page.add("bullets", in_short(results))
-    if results.swept is None:
+    _add_leaderboard(page, results)
+    _add_maps(page, results)
+    if results.has_conditions:
         _add_ladder(page, results)
     _add_changes(page, results)
     _add_phases(page, results)
-    if results.swept is None:
+    if results.has_conditions:
         _add_curves(page, results)
-    _add_sweeps(page, results)
+    if not results.maps:
+        _add_sweeps(page, results)
     if results.learning:
         page.section(
             "Learning curves",
@@ -61,6 +66,40 @@ def _page(results: Results) -> Page:
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
+
+
+def _add_leaderboard(page: Page, results: Results) -> None:
+    """The leaderboard, what learning adds, and folded away the single scenarios."""
+    found = results.standings
+    if not found:
+        return
+    main, single = board(found), scenarios_board(found)
+    page.section("Leaderboard", legend(found))
+    page.add("board", main)
+    head, rows = paired_rows(found)
+    if rows:
+        page.add("heading", "What learning adds")
+        page.add("text", PAIRED)
+        page.add("table", {"head": head, "rows": rows, "words": 3})
+    if single is not None:
+        page.add("board", single, folded=f"Single scenarios, {main.columns[0][1]}")
+
+
+def _add_maps(page: Page, results: Results) -> None:
+    """Heat maps: who is best, learning against the best policy without it, and folded away every policy's score."""
+    if not results.maps:
+        return
+    page.section(
+        "Maps",
+        "Who is best where, and what learning changes against the best policy without it, in per cent: green and below "
+        "zero, learning is ahead; red and above zero, it is behind. A star: not told from chance, or too few training "
+        "seeds. A cross counts failed episodes.",
+    )
+    for heat_map in results.maps:
+        found = panels(heat_map)
+        page.add("heading", capital(f"{heat_map.column.title}, {heat_map.title}"))
+        page.add("map", [panel for panel in found if panel.is_main])
+        page.add("map", [panel for panel in found if not panel.is_main], folded="Scores of every policy")
 
 
 def _add_ladder(page: Page, results: Results) -> None:
@@ -81,22 +120,28 @@ def _add_ladder(page: Page, results: Results) -> None:
 
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
-    trained = [row for row in results.changes if row.is_family]
+    trained = [row for row in results.changes if row.is_family and not row.is_rival]
+    against_best = [row for row in results.changes if row.is_rival]
     others = [row for row in results.changes if not row.is_family]
     more = {"colour": results.lines.colour, "swept": results.swept_options}
-    if trained:
-        drawn = results.swept is None
+    for name, rows in (
+        ("Residuals against their base", trained),
+        (f"Residuals against the {BEST_ANALYTIC}", against_best),
+    ):
+        if not rows:
+            continue
+        drawn = results.has_conditions
         marks = " Open circles are held out, stars are ceilings on the training condition." if drawn else ""
         page.section(
-            "Residuals against their base",
+            name,
             "Change on the same episodes, with 95 % intervals over training seeds. Green: the interval lies below "
             f"zero; red: above; grey: it includes zero, or there are too few training seeds.{marks}",
         )
-        for title in dict.fromkeys(row.policy for row in trained if drawn):
-            own = [row for row in trained if row.policy == title and row.is_judged]
+        for title in dict.fromkeys(row.policy for row in rows if drawn):
+            own = [row for row in rows if row.policy == title and row.is_judged]
             page.add("heading", f"{title} against {own[0].base}")
             page.add("chart", forest(own))
-        page.add("changes", {"lines": by_line(trained), **more}, _if_long("Table of changes", trained))
+        page.add("changes", {"lines": by_line(rows), **more}, _if_long("Table of changes", rows))
     if others:
         page.section(
             "Baselines against one another",
@@ -144,8 +189,8 @@ def _add_sweeps(page: Page, results: Results) -> None:
                     t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
                 }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
-    elif has_swept_references(results.evaluations):
-        for scenario in lines.scenarios:
+    else:
+        for scenario in swept_scenarios(results.evaluations):
             points = {t: _by_number(lines.cell(t, scenario=scenario)) for t in lines.titles}
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
     if not charts:

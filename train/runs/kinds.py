@@ -6,7 +6,8 @@ from typing import Any
 TELLING = {
     "comparison": (
         "elastic compare",
-        {"references", "policies", "episodes", "scenario_episodes", "figure_policies", "sweep", "groups"},
+        {"references", "policies", "episodes", "scenario_episodes", "reference_scenarios", "figure_policies", "sweep",
+         "map", "groups", "leaderboard"},
     ),
     "training": (
         "elastic train",

@@ -1,0 +1,334 @@
+"""The leaderboard: who is in which track, what a cell holds, who is best, and that all of its forms agree."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rich.console import Console
+
+import train.experiments.compare
+import train.experiments.timing
+from baselines.catalogue import Track
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError
+from tests.cells import METRIC, cell, family
+from train.commands.cli import main
+from train.evaluate.changes import changes
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.leaderboard import Paired, Standing, standings
+from train.evaluate.statistics import Estimate, over_seeds
+from train.experiments.compare import CompareConfig, Sweep
+from train.experiments.timing import step_times
+from train.report import Results, write_report
+from train.report.leaderboard import (
+    board,
+    leaderboard_markdown,
+    paired_rows,
+    read_leaderboard,
+    scenarios_board,
+    three_digits,
+    write_leaderboard,
+)
+from train.report.leaderboard_page import BEGIN, END, page_with
+from train.report.leaderboard_page import main as write_page
+from train.runs.folders import run_folder
+
+ROOT = Path(__file__).parents[1]
+GROUPS = {"both": ["soft", "ideal"], "all": ["soft", "ideal", "slope"]}
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test works in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+
+def with_rival(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
+    """Training seeds that are also compared with `best`."""
+    found = []
+    for e in evaluations:
+        assert e.condition.member is not None
+        found.append(Evaluation(e.condition.replace(member=e.condition.member.replace(rival="best")), e.episodes))
+    return found
+
+
+SOFT, IDEAL = [[4.0, 6.0], [3.0, 5.0], [8.0, 8.0], [1.0, 1.0], [2.0, 2.0]], [[1.0, 1.0]] * 5
+
+
+def played() -> list[Evaluation]:
+    """Two bases, a residual and who reads more, at 3 s in three scenarios and at 1.6 s in one."""
+    slow = [
+        cell("base", {"all": [8.0, 10.0]}, "soft"), cell("base", {"all": [3.0]}, "ideal"),
+        cell("base", {"all": [2.0]}, "slope"),
+        cell("best", {"all": [4.0, None]}, "soft"), cell("best", {"all": [1.0]}, "ideal"),
+        cell("best", {"all": [1.0]}, "slope"),
+        *with_rival([*family(SOFT, "soft"), *family(IDEAL, "ideal"), *family([[5.0]] * 5, "slope")]),
+    ]  # fmt: skip
+    sensor = [cell("sensor", {"all": [n]}, s) for n, s in ((7.0, "soft"), (2.0, "ideal"), (1.0, "slope"))]
+    named = PolicySpec(name="mine.py:make", label="sensor", track=Track.TORQUE_SENSORS)
+    sensor = [Evaluation(e.condition.replace(policy=named), e.episodes) for e in sensor]
+    return [*slow, *sensor, cell("base", {"all": [6.0]}, "soft", reference=1.6)]
+
+
+def rows() -> list[Standing]:
+    """The rows of its leaderboard; the intervals take a while, so they are computed once."""
+    return list(_ROWS or _ROWS.extend(_rows()) or _ROWS)
+
+
+_ROWS: list[Standing] = []
+
+
+def _rows() -> list[Standing]:
+    found = played()
+    return standings(found, changes(found, GROUPS), GROUPS, {"base": 20.4, "best": 31.0, "learned": 45.2})
+
+
+def row(policy: str, scope: str, reference: str = "3 s") -> Standing:
+    """One of them, of the pelvis error."""
+    return next(s for s in rows() if (s.policy, s.scope, s.reference, s.metric) == (policy, scope, reference, METRIC))
+
+
+def change_to(paired: Paired | None) -> Estimate:
+    """A paired change that is there."""
+    assert paired is not None
+    return paired.change
+
+
+# Scores.
+
+
+def test_a_score_is_a_mean_of_scenarios_and_of_training_seeds() -> None:
+    """Catches a mean over episodes where scenarios have different numbers, a median, and falls averaged in."""
+    assert row("base", "both").score == Estimate((9.0 + 3.0) / 2.0)
+    assert row("best", "both").score == Estimate((4.0 + 1.0) / 2.0)
+    assert (row("best", "both").failed, row("best", "both").episodes) == (1, 3)
+    assert row("learned", "both").score == over_seeds([(s + 1.0) / 2.0 for s in (5.0, 4.0, 8.0, 1.0, 2.0)])
+    assert (row("learned", "both").training_seeds, row("base", "both").training_seeds) == (5, 0)
+
+
+def test_changes_of_a_residual_are_those_of_the_statistics() -> None:
+    """Catches base and rival swapped, and changes of another scope or motion."""
+    found = played()
+    for scope in ("both", "soft"):
+        pairs = [c for c in changes(found, GROUPS)
+                 if (c.policy, c.scope, c.reference, c.column.metric) == ("learned", scope, "3 s", METRIC)]  # fmt: skip
+        base, rival = row("learned", scope).base, row("learned", scope).rival
+        assert base is not None
+        assert rival is not None
+        assert (base.to, rival.to) == ("base", "best")
+        assert [base.change, rival.change] == [c.relative for c in pairs]
+    assert row("base", "both").base is None
+
+
+def test_columns_are_whole_groups_and_what_is_in_none() -> None:
+    """Catches a group that is shown though one of its scenarios is not played, and a scenario that nobody sees."""
+    assert board(rows()).columns == (("both", "3 s"), ("all", "3 s"), ("soft", "1.6 s"))
+    single = scenarios_board(rows())
+    assert single is not None
+    assert single.columns == (("soft", "3 s"), ("ideal", "3 s"), ("slope", "3 s"))
+    found = [e for e in played() if e.condition.reference == 3]
+    without = standings(found, changes(found), {}, {})
+    assert board(without).columns == single.columns
+    assert scenarios_board(without) is None
+
+
+# The table.
+
+
+def test_tracks_hold_those_with_the_same_needs_the_best_first() -> None:
+    """Catches a policy of one's own in the wrong track, and an order by name."""
+    tracks = {name: [r.policy for r in own] for name, own in board(rows()).tracks}
+    assert tracks == {
+        str(Track.STANDARD): ["best", "base"], str(Track.TORQUE_SENSORS): ["sensor"], str(Track.TRAINING): ["learned"],
+    }  # fmt: skip
+    condition = Condition(env="walker", policy=PolicySpec(name="mine.py:make"))
+    assert condition.track is Track.STANDARD
+    with pytest.raises(ConfigurationError, match=r"track must be .*joint torque sensors.*got 'torque'"):
+        PolicySpec(name="mine.py:make", track="torque")  # type: ignore[arg-type]
+
+
+def test_the_best_of_a_track_has_the_fewest_falls_first() -> None:
+    """Catches a mark for who fell in the hard episodes, and a track without any."""
+    (_, (best, base)), (_, (sensor,)), _ = board(rows()).tracks
+    assert [entry.is_best for entry in (best.entries[0], base.entries[0])] == [(False, False), (True, True)]
+    assert (best.entries[0].figures[0], best.entries[0].failed) == ("2500", "✕1/3")
+    assert [entry.is_best for entry in sensor.entries[:2]] == [(True, True)] * 2
+    assert best.entries[2].figures == ("not played",)
+    assert (best.failed, best.step, base.failed, base.step) == ("1/4", "31", "0/5", "20")
+    assert sensor.step == "-"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(2.481, "2.48"), (11.24, "11.2"), (10.0, "10.0"), (9.999, "10.0"), (123.4, "123"), (0.5, "0.500"), (0.0, "0.00"),
+     (1234.0, "1234"), (float("nan"), "-")],
+)  # fmt: skip
+def test_figures_have_three_digits(value: float, text: str) -> None:
+    """Catches 10 beside 11.2, and digits that nobody measured."""
+    assert three_digits(value) == text
+
+
+# Forms.
+
+
+def test_all_forms_have_the_same_figures() -> None:
+    """Catches a page, a table or a report that says something else than the CSV."""
+    found = played()
+    with run_folder("x", {}, 0) as folder:
+        table, text = write_leaderboard(rows(), folder)
+        write_report(Results("x", found, changes(found, GROUPS), folder, standings=rows()))
+    again = read_leaderboard(table)
+    (mine,), (theirs,) = (
+        [s for s in some if (s.policy, s.scope, s.metric) == ("learned", "soft", METRIC)] for some in (again, rows())
+    )
+    none = {"score": Estimate(0.0), "base": None, "rival": None, "step_us": 0.0}
+    assert replace(mine, **none) == replace(theirs, **none)
+    for found_again, was in ((mine.score, theirs.score), (change_to(mine.rival), change_to(theirs.rival))):
+        bounds = [[e.value, e.low, e.high] for e in (found_again, was)]
+        assert bounds[0] == pytest.approx(bounds[1], rel=1e-5)
+    assert leaderboard_markdown(again) == leaderboard_markdown(rows())
+    assert text.read_text() == f"# Leaderboard\n\n{leaderboard_markdown(rows())}"
+    markdown = text.read_text()
+    assert "| base | **6000** / **6000** | " in markdown
+    assert "episodes of a scenario, per training seed: 1 to 2." in markdown
+    assert "<br><sub>[" in markdown
+    assert leaderboard_markdown(rows()).rstrip() in (folder / "report.md").read_text()
+    page = (folder / "report.html").read_text()
+    assert re.findall(r"<h2 id=\"s\d+\">([^<]*)</h2>", page)[1] == "Leaderboard"
+    assert "<b>6000</b> / <b>6000</b></td>" in page
+    assert '2500 / 2500 <span class="falls">✕1/3</span>' in page
+    head, lines = paired_rows(rows())
+    assert head[-1] == "against the best policy without learning"
+    assert lines[0][:3] == ["learned", "both, 3 s", "pelvis error rms"]
+    assert lines[0][3].endswith("(base)")
+    assert lines[0][4].endswith("(best)")
+
+
+def test_a_page_is_written_between_its_marks_and_nowhere_else() -> None:
+    """Catches text of the page that is lost, tables that pile up, and a page without marks."""
+    table, _ = write_leaderboard(rows(), Path())
+    page = Path("page.md")
+    page.write_text(f"before\n{BEGIN}\nold 1.23\n{END}\nafter\n")
+    for _ in range(2):
+        write_page([str(table), str(page)])
+        assert page.read_text() == f"before\n{BEGIN}\n\n{leaderboard_markdown(rows())}\n{END}\nafter\n"
+    for text in ("no marks", f"{END}\n{BEGIN}", f"{BEGIN}\n{END}\n{BEGIN}\n{END}"):
+        with pytest.raises(ConfigurationError, match="needs the lines"):
+            page_with(text, rows())
+    Path("other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ConfigurationError, match=r"other.csv is no leaderboard.csv: its columns must be track, policy"):
+        read_leaderboard(Path("other.csv"))
+
+
+def test_the_page_of_the_docs_is_that_of_the_results_beside_it() -> None:
+    """Catches a figure that somebody typed, and results that were renewed without the page."""
+    page = (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+    assert page_with(page, read_leaderboard(ROOT / "docs" / "results" / "leaderboard.csv")) == page
+
+
+# The configuration.
+
+
+def test_a_reference_is_played_in_its_own_scenarios() -> None:
+    """Catches a slow motion that is played everywhere, and one whose scenarios are those of another."""
+    values: dict[str, Any] = {
+        "name": "c", "env": "walker", "references": [3, 1.6], "scenarios": ["nominal", "soft"], "policies": ["input"],
+    }  # fmt: skip
+    config = CompareConfig(**values, reference_scenarios={"1.6 s": ["soft"]})
+    assert [(c.reference, c.scenario) for c in config.conditions()] == [(3, "nominal"), (3, "soft"), (1.6, "soft")]
+    for wrong, message in (
+        ({"1.6": ["soft"]}, "unknown reference with scenarios of its own '1.6'; choose one of: 3 s, 1.6 s"),
+        ({"1.6 s": ["slope"]}, "unknown scenario of '1.6 s' 'slope'"),
+        ({"1.6 s": []}, "reference_scenarios of '1.6 s' must have a scenario"),
+        ({"1.6 s": ["soft", "soft"]}, "the scenario of '1.6 s' 'soft' stands twice"),
+    ):
+        with pytest.raises(ConfigurationError, match=re.escape(message)):
+            CompareConfig(**values, reference_scenarios=wrong)
+    with pytest.raises(ConfigurationError, match="a leaderboard is of simulated cells without a sweep"):
+        CompareConfig(**values, leaderboard=True, sweep=Sweep(option="stiffness_scale", values=[1, 2]))
+
+
+def test_the_leaderboard_of_the_project_has_its_columns() -> None:
+    """Catches a group that lost its columns by a scenario that is not played."""
+    config = load_yaml(ROOT / "configs" / "leaderboard.yaml", CompareConfig)
+    conditions = config.conditions()
+    cells = {(c.reference_name, c.scenario) for c in conditions}
+    assert {r: sum(reference == r for reference, _ in cells) for r in ("3 s", "24 s", "1.6 s", "1.1 s")} == {
+        "3 s": 14, "24 s": 1, "1.6 s": 5, "1.1 s": 5,
+    }  # fmt: skip
+    assert {len(scenarios) for scenarios in config.groups.values()} == {5, 3, 6}
+    assert {c.track for c in conditions} >= set(Track) - {Track.WALKS}
+
+
+# Time per step.
+
+
+class Scripted:
+    """A policy that takes given times."""
+
+    log: list[str] = []
+    spent = {"a": [99.0, 1.0, 7.0, 2.0], "b": [99.0, 5.0, 5.0, 50.0]}
+
+    def __init__(self, condition: Condition) -> None:
+        self.title = condition.policy.title
+        self.times = iter(self.spent[self.title])
+
+    def play(self, steps: int) -> float:
+        """Its next time for 10 steps [s]."""
+        assert steps == 10
+        self.log.append(self.title)
+        return 1e-5 * next(self.times)
+
+    def close(self) -> None:
+        """Say so."""
+        self.log.append(f"close {self.title}")
+
+
+def test_times_are_medians_of_rounds_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches one policy after the other, compiling that is timed, a mean, and times of the whole round."""
+    monkeypatch.setattr(train.experiments.timing, "_Player", Scripted)
+    conditions = [Condition(env="walker", policy=PolicySpec(name="zero", label=title)) for title in ("a", "b", "a")]
+    assert step_times(conditions, steps=10, rounds=3) == pytest.approx({"a": 2.0, "b": 5.0})
+    assert Scripted.log == ["a", "b"] * 4 + ["close a", "close b"]
+
+
+# elastic compare with a leaderboard.
+
+
+def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a leaderboard that the command does not write, and a user's policy that is not on it."""
+    Path("mine.py").write_text(
+        "import baselines\n\n\ndef make(env):\n    return baselines.make('uncompensated', env)\n"
+    )
+    content = {
+        "name": "board", "env": "walker", "references": [{"step_period": 1.1, "num_steps": 1}], "leaderboard": True,
+        "scenarios": ["ideal"], "groups": {"mixture": ["ideal"]},
+        "policies": ["uncompensated", {"name": "mine.py:make", "track": "walks on this robot"}],
+    }  # fmt: skip
+    Path("board.yaml").write_text(yaml.safe_dump(content))
+
+    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+        return [evaluate(condition, num_threads=1) for condition in conditions]
+
+    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
+    monkeypatch.setattr(train.experiments.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1))
+    monkeypatch.setattr(train.experiments.compare, "draw_figures", lambda *_: [])
+    main(["compare", "board.yaml"])
+    folder = Path("runs/board")
+    with (folder / "leaderboard.csv").open(newline="") as file:
+        found = [r for r in csv.DictReader(file) if r["pooled"] == "True" and r["metric"] == METRIC]
+    assert [(r["policy"], r["track"]) for r in found] == [
+        ("uncompensated", "encoders, foot sensors and IMU"), ("mine.py:make", "walks on this robot"),
+    ]  # fmt: skip
+    assert found[0]["mean"] == found[1]["mean"]
+    with (folder / "episodes.csv").open(newline="") as file:
+        episodes = [float(r[METRIC]) for r in csv.DictReader(file)]
+    assert float(found[0]["mean"]) == pytest.approx(episodes[0], rel=1e-5)
+    assert "**walks on this robot**" in (folder / "leaderboard.md").read_text()

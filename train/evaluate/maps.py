@@ -1,0 +1,244 @@
+"""Maps over two axes: which policy is best where, and how far learning is ahead of the best policy without it.
+
+An axis is a field of the scenario, such as the stiffness, or the motion, such as the step period.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+from pydantic import Field, model_validator
+
+from baselines.catalogue import Track
+from baselines.options import PolicyOptions
+from elastic_env.core.config import MOST_ENTRIES, Model, Title
+from elastic_env.core.errors import ConfigurationError, choices_listed, shown
+from elastic_env.runtime.scenario import GROUNDS
+from train.evaluate.changes import Change, families, level, paired
+from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
+from train.evaluate.environments import Column, Environment
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.statistics import Estimate
+
+_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}
+"""Units in which an axis is shown, with the factor from SI."""
+
+
+class Axis(Model):
+    """An axis of a map."""
+
+    what: Title
+    """A field of the scenario, such as scenario.stiffness_scale or scenario.pelvis_imu.bias_spread_rad, or the motion:
+    step_period on the walker, reference on the testbed."""
+    values: list[Any] = Field(min_length=2, max_length=MOST_ENTRIES)
+    """Values in SI units; of the motion references as `references` has them."""
+    label: Title | None = None
+    """What the axis says, with its unit; None for the description of the field."""
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether it varies the motion, and not the scenario."""
+        return not self.what.startswith(SCENARIO)
+
+    @property
+    def title(self) -> str:
+        """What the axis says."""
+        if self.label is not None:
+            return self.label
+        if self.is_motion:
+            return self.what.replace("_", " ") + (" [s]" if self.what == "step_period" else "")
+        description, unit = scenario_fields()[self.what]
+        return f"{description.split(': ')[-1]} [{_UNITS.get(unit, (unit, 1.0))[0]}]"
+
+    def ticks(self, known: Environment) -> list[str]:
+        """Its values as they are shown."""
+        if self.is_motion:
+            numbers = [f"{number:g}" for value in self.values for number in known.abscissa(value).values()]
+            return numbers or [known.label(known.arguments(value)[known.motion]) for value in self.values]
+        factor = _UNITS.get(scenario_fields()[self.what][1], ("", 1.0))[1]
+        return [f"{factor * value:.4g}" for value in self.values]
+
+    def place(self, condition: Condition) -> int:
+        """Which of its values a condition has."""
+        values: list[Any] = self.values
+        if self.is_motion:
+            values = [condition.environment.arguments(value) for value in values]
+        mine = condition.environment.arguments(condition.reference) if self.is_motion else condition.swept[self.what]
+        return values.index(mine)
+
+
+class MapConfig(Model):
+    """Two axes of a map."""
+
+    x: Axis
+    """Axis to the right."""
+    y: Axis
+    """Axis upwards."""
+
+    @model_validator(mode="after")
+    def _axes_differ(self) -> Self:
+        if self.x.what == self.y.what:
+            raise ValueError(f"x and y of a map must vary two things, both vary {self.x.what!r}")
+        return self
+
+    @property
+    def axes(self) -> tuple[Axis, Axis]:
+        """Both."""
+        return self.x, self.y
+
+    @property
+    def motion(self) -> Axis | None:
+        """The axis that varies the motion; None where both vary the scenario."""
+        return next((axis for axis in self.axes if axis.is_motion), None)
+
+    def require(self, known: Environment) -> None:
+        """Refuse axes that an environment does not have, and values that they cannot take.
+
+        Raises:
+            ConfigurationError: An axis or a value is wrong.
+        """
+        for name, axis in (("x", self.x), ("y", self.y)):
+            if axis.what != known.motion and axis.what not in scenario_fields():
+                raise ConfigurationError(f"unknown axis {axis.what!r} of map.{name}; {_choices(axis.what, known)}")
+            for value in axis.values:
+                if axis.values.count(value) > 1:
+                    raise ConfigurationError(f"the value {shown(value)} of map.{name} stands twice")
+                if axis.is_motion:
+                    continue  # `references` holds and checks them
+                if isinstance(value, bool) or not isinstance(value, int | float):
+                    raise ConfigurationError(f"values of map.{name} must be numbers, got {shown(value)}")
+                varied(GROUNDS["nominal"], {axis.what: value})
+
+    def coordinates(self) -> list[dict[str, float]]:
+        """Fields of the scenario in every cell, for one motion."""
+        found: list[dict[str, float]] = [{}]
+        for axis in self.axes:
+            if not axis.is_motion:
+                found = [{**fields, axis.what: float(value)} for fields in found for value in axis.values]
+        return found
+
+
+def _choices(what: str, known: Environment) -> str:
+    """What an axis can vary."""
+    hint = "; an option of the policies is varied by sweep, not by a map" if what in PolicyOptions.model_fields else ""
+    return choices_listed(what, [known.motion, *scenario_fields()]) + hint
+
+
+@dataclass(frozen=True, eq=False)
+class MapCell:
+    """One cell of a map.
+
+    Attributes:
+        levels: Mean score of every policy over the episodes that did not fail; of residuals over training seeds [SI].
+        failed: Episodes of every policy that failed, and all.
+        best: The best policy; None where no episode of any reached its end.
+        best_analytic: The best one without learning and with the standard sensors.
+        learned: Paired change of every residual against that one.
+    """
+
+    levels: Mapping[str, Estimate]
+    failed: Mapping[str, tuple[int, int]]
+    best: str | None
+    best_analytic: str | None
+    learned: Mapping[str, Change]
+
+
+@dataclass(frozen=True, eq=False)
+class HeatMap:
+    """A metric over both axes, in one scenario and, where no axis is the motion, with one motion.
+
+    Attributes:
+        title: Scenario and motion.
+        column: The metric.
+        x, y: The axes.
+        known: The environment.
+        policies: Titles of all policies.
+        families: Those that are residuals.
+        cells: (len(y.values), len(x.values)).
+    """
+
+    title: str
+    column: Column
+    x: Axis
+    y: Axis
+    known: Environment
+    policies: tuple[str, ...]
+    families: tuple[str, ...]
+    cells: tuple[tuple[MapCell, ...], ...]
+
+    @property
+    def flat(self) -> list[MapCell]:
+        """All cells."""
+        return [cell for row in self.cells for cell in row]
+
+
+def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[HeatMap]:
+    """The maps of a comparison, one per scenario, motion and judged metric.
+
+    Args:
+        evaluations: All cells, one per training seed.
+        config: The axes.
+    """
+    groups: dict[str, list[Evaluation]] = {}
+    for e in evaluations:
+        motion = [] if config.motion else [e.condition.environment.title(e.condition.reference_name)]
+        groups.setdefault(", ".join([*motion, e.condition.scenario]), []).append(e)
+    return [
+        _heat_map(title, own, config, column)
+        for title, own in groups.items()
+        for column in own[0].condition.environment.judged
+    ]
+
+
+def _rank(scored: tuple[Estimate, tuple[int, int]]) -> tuple[float, float]:
+    estimate, (failed, played) = scored
+    value = estimate.value
+    return failed / max(played, 1), value if value == value else float("inf")  # nan equals nothing
+
+
+def best_of(scores: Mapping[str, tuple[Estimate, tuple[int, int]]]) -> str | None:
+    """Who has the lowest score among those with the smallest share of failures; None where nobody has a score.
+
+    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures count first.
+    """
+    known = {title: scored for title, scored in scores.items() if scored[0].value == scored[0].value}
+    return min(known, key=lambda title: _rank(known[title])) if known else None
+
+
+def failed_of(members: Sequence[Evaluation]) -> tuple[int, int]:
+    """Episodes that failed, and all, over the training seeds of a policy."""
+    return sum(e.num_failed for e in members), sum(len(e.episodes) for e in members)
+
+
+def _heat_map(title: str, evaluations: Sequence[Evaluation], config: MapConfig, column: Column) -> HeatMap:
+    cells: dict[tuple[int, int], dict[str, list[Evaluation]]] = {}
+    for e in evaluations:
+        place = config.y.place(e.condition), config.x.place(e.condition)
+        cells.setdefault(place, {}).setdefault(e.condition.policy.title, []).append(e)
+    known = evaluations[0].condition.environment
+    return HeatMap(
+        title=title, column=column, x=config.x, y=config.y, known=known,
+        policies=tuple(dict.fromkeys(e.condition.policy.title for e in evaluations)),
+        families=tuple(families(evaluations)),
+        cells=tuple(
+            tuple(_cell(cells[row, place], column) for place in range(len(config.x.values)))
+            for row in range(len(config.y.values))
+        ),
+    )  # fmt: skip
+
+
+def _cell(policies: Mapping[str, list[Evaluation]], column: Column) -> MapCell:
+    """Scores of one cell, and residuals against the best policy without learning there."""
+    scores = {title: (level(own, column), failed_of(own)) for title, own in policies.items()}
+    tracks = {title: own[0].condition.track for title, own in policies.items()}
+    analytic = best_of({title: scored for title, scored in scores.items() if tracks[title] is Track.STANDARD})
+    learned = {} if analytic is None else {
+        title: paired(own, policies[analytic], column)
+        for title, own in policies.items() if own[0].condition.member is not None
+    }  # fmt: skip
+    return MapCell(
+        levels={title: estimate for title, (estimate, _) in scores.items()},
+        failed={title: failed for title, (_, failed) in scores.items()},
+        best=best_of({title: scored for title, scored in scores.items() if tracks[title] is not Track.TRUTH}),
+        best_analytic=analytic, learned=learned,
+    )  # fmt: skip

@@ -1,0 +1,71 @@
+"""How much processor time policies take for a control step of one world, measured in turn on one thread."""
+
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from train.evaluate.conditions import Condition
+from train.evaluate.evaluate import make_policy, make_vector_env
+
+_STEPS, _ROUNDS = 50, 15
+"""Control steps per round: whole decisions of residuals, which take 25; rounds, of which the median counts."""
+
+
+def step_times(conditions: Sequence[Condition], steps: int = _STEPS, rounds: int = _ROUNDS) -> dict[str, float]:
+    """Median processor time of every policy alone for a control step of one world [µs], by its title.
+
+    The policies play in turn, round by round, so that what else the computer does concerns all of them alike. The
+    first round compiles and warms up, and does not count. Of a residual the first training seed plays. Processor time
+    does not count what other programs take meanwhile.
+
+    Args:
+        conditions: Cells of a comparison; each policy plays the first of its own.
+        steps: Control steps per round.
+        rounds: Rounds that count.
+    """
+    first: dict[str, Condition] = {}
+    for condition in conditions:
+        first.setdefault(condition.policy.title, condition)
+    players = {title: _Player(condition) for title, condition in first.items()}
+    try:
+        times: dict[str, list[float]] = {title: [] for title in players}
+        for number in range(rounds + 1):
+            for title, player in players.items():
+                spent_s = player.play(steps)
+                if number > 0:
+                    times[title].append(1e6 * spent_s / steps)
+    finally:
+        for player in players.values():
+            player.close()
+    return {title: statistics.median(own) for title, own in times.items()}
+
+
+class _Player:
+    """A policy in an environment of one world."""
+
+    def __init__(self, condition: Condition) -> None:
+        self._env = make_vector_env(condition, 1, num_threads=1)
+        self._policy = make_policy(condition.policy, self._env, condition.policy_options)
+        self._observation, _ = self._env.reset(seed=condition.seed)
+        self._state: Any = None
+        self._start, self._done = np.ones(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
+
+    def play(self, steps: int) -> float:
+        """Play control steps; the time that the policy alone took [s]."""
+        spent_s = 0.0
+        for _ in range(steps):
+            begin = time.process_time()
+            action, self._state = self._policy.predict(
+                self._observation, state=self._state, episode_start=self._start, deterministic=True
+            )
+            spent_s += time.process_time() - begin
+            self._observation, _, terminated, truncated, _ = self._env.step(action)
+            self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
+        return spent_s
+
+    def close(self) -> None:
+        """End the environment."""
+        self._env.close()

@@ -1,0 +1,197 @@
+"""Heat maps as panels of coloured squares with text: the same for the report's page and for pictures."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from string import ascii_uppercase
+from typing import Any
+
+import numpy as np
+
+from train.evaluate.changes import BEST_ANALYTIC, Change, percent
+from train.evaluate.environments import Column
+from train.evaluate.maps import HeatMap, MapCell
+from train.figures.plots import colours, require_matplotlib, save
+
+INK = "#1f2328"
+_AHEAD, _BEHIND, _SCORE, _EMPTY = "#1a7f5a", "#b42318", "#2a6f97", "#f1f3f5"
+_STRONGEST, _STRONGEST_CHANGE = 0.75, 1.0
+"""Share of a colour in the strongest square, and the change from which on it has that share."""
+_BEST_SHARE = 0.32
+"""Share of a policy's colour in a square that it wins."""
+
+
+@dataclass(frozen=True)
+class Square:
+    """A cell of a panel.
+
+    Attributes:
+        text: What it says.
+        small: A second line; empty for none.
+        colour: Its background.
+    """
+
+    text: str
+    small: str
+    colour: str
+
+    @property
+    def ink(self) -> str:
+        """Colour of its text: light on a dark background."""
+        red, green, blue = _rgb(self.colour)
+        return "#ffffff" if 0.299 * red + 0.587 * green + 0.114 * blue < 128.0 else INK
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A heat map of one thing.
+
+    Attributes:
+        title: What it shows.
+        x_label, y_label: What the axes say.
+        x_ticks, y_ticks: Their values as they are shown.
+        squares: (len(y_ticks), len(x_ticks)), from the least y on.
+        is_main: Whether pictures show it too.
+        key: Letters, policies and colours that its squares refer to.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    x_ticks: tuple[str, ...]
+    y_ticks: tuple[str, ...]
+    squares: tuple[tuple[Square, ...], ...]
+    is_main: bool = True
+    key: tuple[tuple[str, str, str], ...] = ()
+
+
+def panels(heat_map: HeatMap) -> list[Panel]:
+    """Who is best, every residual against the best policy without learning, and the score of every policy."""
+    column, shades = heat_map.column, colours(heat_map.policies)
+    letters = dict(zip(heat_map.policies, ascii_uppercase, strict=False))  # a map with more would not be readable
+    key = tuple((letters.get(title, "?"), title, shades[title]) for title in heat_map.policies)
+    many = len({cell.best_analytic for cell in heat_map.flat} - {None}) > 1
+    found = [
+        _panel(heat_map, f"Best policy, and its {column.label}", lambda c: _best(c, column, letters, shades), key=key)
+    ]
+    for title in heat_map.families:
+        what = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
+        found.append(_panel(heat_map, what, lambda c, t=title: _learned(c.learned.get(t), letters if many else {})))
+    levels = [e.value for cell in heat_map.flat for e in cell.levels.values() if np.isfinite(e.value) and e.value > 0.0]
+    ends = (min(levels), max(levels)) if levels else (1.0, 1.0)
+    for title in heat_map.policies:
+        found.append(
+            _panel(heat_map, f"{title}, {column.label}", lambda c, t=title: _level(c, t, column, ends), is_main=False)
+        )
+    return found
+
+
+def draw_map(heat_map: HeatMap, path: Path) -> Path:
+    """Draw the main panels of a map, one below the other, in a width that a telephone shows."""
+    plt = require_matplotlib()
+    shown = [panel for panel in panels(heat_map) if panel.is_main]
+    columns, rows = len(heat_map.x.values), len(heat_map.y.values)
+    size = max(0.72 * columns + 0.9, 4.4), (0.5 * rows + 1.25) * len(shown) + 0.35
+    figure, axes = plt.subplots(len(shown), 1, figsize=size, squeeze=False, layout="constrained")
+    for axis, panel in zip(axes[:, 0], shown, strict=True):
+        _draw_panel(axis, panel)
+    figure.suptitle(heat_map.title, fontsize=9, color="#59636e")
+    return save(figure, path)
+
+
+def _panel(heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], **more: Any) -> Panel:
+    return Panel(
+        title=title, x_label=heat_map.x.title, y_label=heat_map.y.title,
+        x_ticks=tuple(heat_map.x.ticks(heat_map.known)), y_ticks=tuple(heat_map.y.ticks(heat_map.known)),
+        squares=tuple(tuple(map(square, row)) for row in heat_map.cells), **more,
+    )  # fmt: skip
+
+
+def _best(cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]) -> Square:
+    if cell.best is None:
+        return Square("-", "", _EMPTY)
+    value = f"{column.scale * cell.levels[cell.best].value:.{_decimals(column)}f}"
+    return Square(letters.get(cell.best, "?"), f"{value}{_falls(cell.failed[cell.best])}",
+                  blended(shades[cell.best], _BEST_SHARE))  # fmt: skip
+
+
+def _learned(change: Change | None, letters: Mapping[str, str]) -> Square:
+    """A change, with a star where it is not told from chance; green below zero, red above."""
+    if change is None or not np.isfinite(change.relative.value):
+        return Square("-", "", _EMPTY)
+    value = change.relative.value
+    star = "" if change.verdict in ("lower", "higher") else "*"
+    share = _STRONGEST * min(abs(value) / _STRONGEST_CHANGE, 1.0)
+    small = f"to {letters[change.base]}" if change.base in letters else ""
+    falls = f" ✕{change.falls}/{change.episodes}" if change.falls_more else ""
+    return Square(percent(value).removesuffix(" %") + star, f"{small}{falls}".strip(),
+                  blended(_AHEAD if value < 0.0 else _BEHIND, share))  # fmt: skip
+
+
+def _level(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
+    if title not in cell.levels or not np.isfinite(cell.levels[title].value):
+        return Square("-", _falls(cell.failed.get(title, (0, 0))).strip(), _EMPTY)
+    value = cell.levels[title].value
+    low, high = map(math.log, ends)
+    share = (math.log(max(value, ends[0])) - low) / (high - low) if high > low else 0.0
+    return Square(f"{column.scale * value:.{_decimals(column)}f}", _falls(cell.failed[title]).strip(),
+                  blended(_SCORE, 0.06 + (_STRONGEST - 0.06) * share))  # fmt: skip
+
+
+def _falls(failed: tuple[int, int]) -> str:
+    return f" ✕{failed[0]}/{failed[1]}" if failed[0] else ""
+
+
+def _decimals(column: Column) -> int:
+    """Decimals in a square, where there is little room."""
+    return min(column.decimals, 1)
+
+
+def blended(colour: str, share: float) -> str:
+    """A colour on white, of which it covers a share."""
+    return "#" + "".join(f"{round(share * part + (1.0 - share) * 255):02x}" for part in _rgb(colour))
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _draw_panel(axis: Any, panel: Panel) -> None:
+    pixels = np.array([[_rgb(square.colour) for square in row] for row in panel.squares], dtype=np.uint8)
+    axis.imshow(pixels, origin="lower", aspect="auto")
+    for y, row in enumerate(panel.squares):
+        for x, square in enumerate(row):
+            lift = 0.16 if square.small else 0.0
+            axis.text(x, y + lift, square.text, ha="center", va="center", color=square.ink, fontsize=10)
+            axis.text(x, y - 0.24, square.small, ha="center", va="center", color=square.ink, fontsize=7.5)
+    axis.set_xticks(range(len(panel.x_ticks)), panel.x_ticks)
+    axis.set_yticks(range(len(panel.y_ticks)), panel.y_ticks)
+    axis.set_xlabel(_wrapped(panel.x_label))
+    axis.set_ylabel(_wrapped(panel.y_label, 24))
+    axis.set_title(_wrapped(panel.title), fontsize=9.5)
+    axis.grid(visible=False)
+    axis.tick_params(length=0)
+    for edge in np.arange(1, len(panel.x_ticks)) - 0.5:
+        axis.axvline(edge, color="white", lw=2.0)
+    for edge in np.arange(1, len(panel.y_ticks)) - 0.5:
+        axis.axhline(edge, color="white", lw=2.0)
+    for side in ("left", "bottom"):
+        axis.spines[side].set_visible(False)
+    if panel.key:
+        text = "   ".join(f"{letter} {title}" for letter, title, _ in panel.key)
+        axis.annotate(_wrapped(text, 60), (0.0, 0.0), (0, -34), xycoords="axes fraction", textcoords="offset points",
+                      fontsize=8, va="top")  # fmt: skip
+
+
+def _wrapped(text: str, width: int = 52) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(text, width))
+
+
+def in_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of a panel as a table, the greatest y first."""
+    rows: Sequence[tuple[str, Sequence[Square]]] = list(zip(panel.y_ticks, panel.squares, strict=True))[::-1]
+    head = [f"{panel.y_label} \\ {panel.x_label}", *panel.x_ticks]
+    return head, [[tick, *(" ".join(filter(None, (s.text, s.small))) for s in row)] for tick, row in rows]
