@@ -218,5 +218,5 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
 
 BEST_ON_THE_WALKER: str | None = "adaptive_posture"
 """Best policy of the walker that needs no training and reads the standard sensors; residuals are compared with it."""
-BEST_ON_JOINTS: str | None = None
-"""The same for robots on a fixed base; None while there is none."""
+BEST_ON_JOINTS: str | None = "friction"
+"""The same for robots on a fixed base."""
