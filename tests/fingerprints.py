@@ -23,12 +23,13 @@ import numpy as np
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.policies import policy_names
+from baselines.catalogue import ON_JOINTS, ON_THE_WALKER, Track
+from baselines.policies import sensors_needed
 from elastic_env.runtime.scenario import scenario_names
 
 RECORDED = Path(__file__).with_name("fingerprints.json")
 STEPS, WORLDS = 300, 7
-WALKER_ALONE = ("uncompensated_open", "input_open", "input_output", "input_wrench")
+POLICIES = {"testbed": ON_JOINTS, "walker": ON_THE_WALKER}
 RESIDUALS = {"testbed": ("testbed/seed_0",), "walker": ("walker_3s/seed_0", "walker_1600ms/seed_0")}
 
 
@@ -62,10 +63,10 @@ def cases() -> list[Case]:
     """Every scenario with one policy, every policy in one scenario, and whole short episodes."""
     found = []
     for env, own in (("testbed", "input"), ("walker", "input_output")):
-        policies = [*policy_names(), *(f"residual:{name}" for name in RESIDUALS[env])]
-        known = [policy for policy in policies if env == "walker" or policy not in WALKER_ALONE]
+        baselines_of = [name for name, known in POLICIES[env].items() if known.track is not Track.WALKS]
+        policies = [*baselines_of, *(f"residual:{name}" for name in RESIDUALS[env])]
         pairs = [(own, scenario) for scenario in scenario_names(walks=env == "walker")]
-        pairs += [(policy, "nominal") for policy in known if policy != own]
+        pairs += [(policy, "nominal") for policy in policies if policy != own]
         found += [Case(env, policy, scenario, worlds) for policy, scenario in pairs for worlds in (1, WORLDS)]
     sine, walk = '{"reference": {"kind": "sine", "duration_s": 1.0}}', '{"step_period": 1.1, "num_steps": 1}'
     whole = [
@@ -81,6 +82,8 @@ _IDS = {"testbed": "elastic_env/Testbed-v0", "walker": "elastic_env/WalkInPlace-
 
 def _made(case: Case) -> Any:
     arguments = {"scenario": case.scenario, **json.loads(case.arguments)}
+    if sensors := sensors_needed(case.policy):
+        arguments["sensors"] = sensors
     if case.worlds == 1:
         return gymnasium.make(_IDS[case.env], disable_env_checker=True, **arguments)
     more = {"num_envs": case.worlds, "vectorization_mode": "vector_entry_point", "num_threads": 1}
