@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from baselines.adaptation.iterative import IterativeLearner
+from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import JointEstimator, LegEstimator, OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
@@ -113,6 +115,24 @@ def _with_posture(build: Builder) -> Builder:
     return build_with_posture
 
 
+def learned_base(options: PolicyOptions, is_walker: bool) -> str:
+    """Name of the policy whose offsets `iterative` learns."""
+    name = options.learned_base or ("adaptive_posture" if is_walker else "input")
+    known = ON_THE_WALKER if is_walker else ON_JOINTS
+    bases = [base for base, policy in known.items() if base != "iterative" and policy.track is Track.STANDARD]
+    if name not in bases:
+        raise unknown_name("base of iterative", name, bases)
+    return name
+
+
+def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+    is_walker = isinstance(model, WalkerModel)
+    known = ON_THE_WALKER if is_walker else ON_JOINTS
+    base = known[learned_base(options, is_walker)].build(env, model, options)
+    signals = learned_signals(model, options.learning)
+    return IterativeLearner(base, model, signals, options.learning.trials, options.ramp_s)
+
+
 def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     """The deflections of some joints by sensors."""
 
@@ -140,6 +160,7 @@ ASSUMED_OPTIONS = _ASSUMED
 _COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
 _CONTROLLER = ("gains", "com_feedback")
 _COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
+_LEARNED = ("learned_base", "learning")
 _MEASURED = (*_ASSUMED, *_CONTROLLER, "adaptation", "ramp_s")
 
 ON_JOINTS: Mapping[str, NamedPolicy] = {
@@ -147,6 +168,7 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "uncompensated": NamedPolicy(_zero),
     "input": NamedPolicy(_around_zero(GravityCompensator), _COMPENSATOR),
     "dynamic": NamedPolicy(_around_zero(DynamicCompensator), _COMPENSATOR),
+    "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
 """Policies of robots on a fixed base. There `uncompensated` has no controller to add and equals `zero`."""
@@ -163,6 +185,7 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "torque_sensor": NamedPolicy(_measured(TORQUE_SENSOR), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)),
     "hip_sensor": NamedPolicy(_measured(LINK_ENCODER, ("hip",)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
     "link_encoder": NamedPolicy(_measured(LINK_ENCODER), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "iterative": NamedPolicy(_iterative, (*_COMPENSATED, "base", "adaptation", "posture", *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
 """Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""
