@@ -45,6 +45,11 @@ class LearnedOffsets:
         self.tables = np.zeros((1, 1, len(signals.names)))
         self._offsets = np.zeros((1, 1, self._n))
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns, with their unit."""
+        return self._signals.names
+
     def play(self, tables: Array) -> None:
         """Take other offsets, (num_worlds or 1, T, k); row t acts in the period that ends t periods after the start."""
         share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]

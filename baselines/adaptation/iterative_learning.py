@@ -61,7 +61,7 @@ def ahead(error: Array, steps: int) -> Array:
     return np.concatenate([error[steps:], np.repeat(error[-1:], min(steps, len(error)), axis=0)])[: len(error)]
 
 
-def credible(error: Array, before: Array, surprise: float) -> Array:
+def credible(error: Array, before: Array, surprise: float | Array) -> Array:
     """An error as far as that of the trial before makes it credible, elementwise.
 
     Args:

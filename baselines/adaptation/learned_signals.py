@@ -37,7 +37,7 @@ class LearningGains(Model):
     """Walker: hip angle per tilt of the pelvis [1], in rad."""
     zmp: ChannelGains = ChannelGains(gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.015, limit=0.06)
     """Walker: shift of the planned ZMP per deviation of the ZMP [1], in m."""
-    joint: ChannelGains = ChannelGains(gain=0.8, lead_s=0.02, cutoff_hz=1.0, surprise=0.01, limit=0.2)
+    joint: ChannelGains = ChannelGains(gain=0.5, lead_s=0.08, cutoff_hz=1.4, surprise=0.01, limit=0.2)
     """Robots on a fixed base: offset per error of the link [1], in rad."""
 
 
@@ -72,7 +72,7 @@ class WalkSignals:
         gains: How they are learned.
     """
 
-    names = ("roll_rad", "pitch_rad", "zmp_x_m", "zmp_y_m")
+    names: tuple[str, ...] = ("roll_rad", "pitch_rad", "zmp_x_m", "zmp_y_m")
 
     def __init__(self, model: WalkerModel, gains: LearningGains) -> None:
         self.gains = (gains.attitude, gains.attitude, gains.zmp, gains.zmp)
