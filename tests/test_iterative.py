@@ -264,7 +264,8 @@ def test_what_was_learned_is_saved_and_played(run: Path) -> None:
 
 def test_another_motion_or_robot_is_refused(run: Path) -> None:
     """Catches offsets that are played in a motion that they are wrong for."""
-    for env in (make_testbed(reference={**SINE, "amplitude": 0.1}), make_testbed(reference={**SINE, "duration_s": 1.0})):
+    for change in ({"amplitude": 0.1}, {"duration_s": 1.0}):
+        env = make_testbed(reference={**SINE, **change})
         with pytest.raises(ConfigurationError, match=r"amplitude|number of rows"):
             baselines.make(f"iterative:{run}", env)
     with pytest.raises(ConfigurationError, match="robot 'testbed'"):

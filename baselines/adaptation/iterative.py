@@ -205,4 +205,5 @@ class Stage:
 
 def _seed_of_noise(robot: int, number: int) -> int:
     """Seed of a trial's noise, other than that of any other trial and of the robot's own episode."""
-    return int(np.random.SeedSequence([robot, number]).generate_state(1, np.uint64)[0] >> 1)
+    sequence = np.random.SeedSequence([robot, number])
+    return int(sequence.generate_state(1, np.uint64)[0] >> 1)
