@@ -81,6 +81,12 @@ def test_errors_follow_the_closed_form_of_the_recursion(plant: float, frequency_
         np.testing.assert_allclose(middle(error), (1.0 - plant * learned) * middle(disturbance), atol=1e-6)
 
 
+def test_forgetting_leaves_the_share_of_the_closed_form() -> None:
+    """Catches forgetting that acts on the correction too: at rest the error is λ / (λ + γ p)."""
+    error = errors(np.ones((10_000, 1)), 1.0, GAIN.replace(forgetting=0.1), 40)[-1]
+    np.testing.assert_allclose(middle(error), 0.1 / (0.1 + GAIN.gain), atol=1e-6)
+
+
 def test_the_right_sign_converges_and_the_wrong_one_diverges() -> None:
     """Catches a learning law that goes the wrong way."""
     right, wrong = (errors(wave(0.5), plant, GAIN, 10)[-1] for plant in (1.0, -1.0))

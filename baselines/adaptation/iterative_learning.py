@@ -1,15 +1,16 @@
 r"""Iterative learning control: what went wrong in a trial corrects the offsets of the next one, at the same time.
 
-.. math:: u_{j+1}(t) = Q \, [\, u_j(t) + \gamma \, e_j(t + \ell) \,]
+.. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
 
 u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j. γ is the learning
-gain. The lead ℓ makes up for the delay from an offset to its effect. Q is a low-pass filter without phase shift, which
-stops the learning where the delay is not known well enough [Longman2000, Elci2002]. With a plant e = d − P u the error
-shrinks from trial to trial where at all frequencies
+gain. A share λ is forgotten, so that noise does not add up where the plant hardly answers. The lead ℓ makes up for the
+delay from an offset to its effect. Q is a low-pass filter without phase shift, which stops the learning where the delay
+is not known well enough [Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where at
+all frequencies
 
-.. math:: | Q \, (1 - \gamma \, e^{i \omega \ell} P) | < 1
+.. math:: | Q \, (1 - \lambda - \gamma \, e^{i \omega \ell} P) | < 1
 
-[Bristow2006]; the wrong sign of γ diverges. Under Q = 1 and P = p it is e_j = (1 − γ p)^j e_0.
+[Bristow2006]; the wrong sign of γ diverges. With Q = 1, λ = 0 and P = p it is e_j = (1 − γ p)^j e_0.
 
 A push in one trial is no error of the robot. So an error may shrink by any amount from one trial to the next, but it
 counts as grown, or as turned over, by no more than a surprise.
@@ -41,6 +42,7 @@ class ChannelGains(Model):
     cutoff_hz: float = quantity("Hz", gt=0, le=100, description="frequency at which Q halves the amplitude")
     surprise: float = quantity("error", gt=0, description="by how much an error can grow from trial to trial")
     limit: float = quantity("offset", gt=0, description="largest offset")
+    forgetting: float = quantity("1", 0.0, ge=0, lt=1, description="share λ of the offset that is forgotten")
 
 
 def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
@@ -84,6 +86,8 @@ def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s:
     """
     following = np.empty_like(table)
     for column, own in enumerate(gains):
-        wanted = table[:, column] + own.gain * ahead(error[:, column], round(own.lead_s / period_s))
+        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain * ahead(
+            error[:, column], round(own.lead_s / period_s)
+        )
         following[:, column] = np.clip(zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit)
     return following
