@@ -4,9 +4,9 @@ r"""Iterative learning control: what went wrong in a trial corrects the offsets 
 
 u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j. γ is the learning
 gain. A share λ is forgotten, so that noise does not add up where the plant hardly answers. The lead ℓ makes up for the
-delay from an offset to its effect. Q is a low-pass filter without phase shift, which stops the learning where the delay
-is not known well enough [Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where at
-all frequencies
+delay from an offset to its effect. Q is a low-pass filter without phase shift, which stops learning where the delay is
+not known well enough [Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where, at
+all frequencies,
 
 .. math:: | Q \, (1 - \lambda - \gamma \, e^{i \omega \ell} P) | < 1
 
