@@ -11,6 +11,8 @@ from typing import Any
 
 from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
 from baselines.adaptation.estimators import EncoderEstimator, LegEstimator
+from baselines.adaptation.iterative import IterativeLearner
+from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
@@ -136,6 +138,24 @@ def _with_posture(build: Builder) -> Builder:
     return build_with_posture
 
 
+def learned_base(options: PolicyOptions, is_walker: bool) -> str:
+    """Name of the policy whose offsets `iterative` learns."""
+    name = options.learned_base or ("adaptive_posture" if is_walker else "input")
+    known = ON_THE_WALKER if is_walker else ON_JOINTS
+    bases = [base for base, policy in known.items() if base != "iterative" and policy.track is Track.STANDARD]
+    if name not in bases:
+        raise unknown_name("base of iterative", name, bases)
+    return name
+
+
+def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+    is_walker = isinstance(model, WalkerModel)
+    known = ON_THE_WALKER if is_walker else ON_JOINTS
+    base = known[learned_base(options, is_walker)].build(env, model, options)
+    signals = learned_signals(model, options.learning)
+    return IterativeLearner(base, model, signals, options.learning.trials, options.ramp_s)
+
+
 def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by them."""
 
@@ -176,6 +196,7 @@ _COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
 _CONTROLLER = ("gains", "com_feedback")
 _COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
 _MEASURED = (*_COMPENSATED, "adaptation")
+_LEARNED = ("learned_base", "learning")
 
 ON_JOINTS: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
@@ -186,6 +207,7 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "disturbance_observer": NamedPolicy(
         _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
     ),
+    "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }
 """Policies of robots on a fixed base. There `uncompensated` has no controller to add and equals `zero`."""
@@ -212,6 +234,7 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "talos": NamedPolicy(
         _talos, (*_ASSUMED, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
     ),
+    "iterative": NamedPolicy(_iterative, (*_COMPENSATED, "base", "adaptation", "posture", *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),
 }
 """Policies of the walker. The controller alone assumes K too, for the ankles' offsets and the friction."""

@@ -3,6 +3,7 @@
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import ObserverGains
+from baselines.adaptation.learned_signals import LearningGains
 from baselines.adaptation.online_stiffness import AdaptationGains
 from baselines.compensation.compensators import OutputMethod
 from baselines.compensation.gravity_torque import GravityMethod
@@ -46,4 +47,8 @@ class PolicyOptions(Model):
     """Walker: filter, bound and rate limit of `talos`."""
     observer: ObserverGains = ObserverGains()
     """Testbed: filters and bound of `disturbance_observer`."""
+    learned_base: str | None = None
+    """The policy whose offsets `iterative` learns; None for `adaptive_posture` on the walker, else `input`."""
+    learning: LearningGains = LearningGains()
+    """How `iterative` learns, and from how many trials."""
     ramp_s: float = quantity("s", STAND_S, gt=0, description="time in which the compensation grows from zero")

@@ -4,6 +4,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from baselines.adaptation.iterative import LearnedOffsets
+from baselines.adaptation.learned_signals import learned_signals
+from baselines.adaptation.offset_table import load_table
 from baselines.catalogue import (
     ASSUMED_OPTIONS,
     BEST_ON_JOINTS,
@@ -18,6 +21,14 @@ from baselines.options import PolicyOptions
 from baselines.residual.residual import RESIDUAL, read_description, residual_policy
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel, read_stiffness
+
+ITERATIVE = "iterative:"
+"""Before the folder of what `iterative` has learned, where policies are named."""
+
+
+def is_saved(name: str) -> bool:
+    """Whether a name is that of a policy in a folder, such as residual:PATH."""
+    return name.startswith((RESIDUAL, ITERATIVE))
 
 
 def policy_names() -> list[str]:
@@ -34,6 +45,8 @@ def track(name: str, is_walker: bool = True) -> Track:
     """What a policy needs, by its name; one of a user's own is taken to read the standard sensors."""
     if name.startswith(RESIDUAL):
         return Track.TRAINING
+    if name.startswith(ITERATIVE):
+        return Track.WALKS
     known = named_policy(name, is_walker)
     return Track.STANDARD if known is None else known.track
 
@@ -69,9 +82,14 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `hip_sensor`, `link_encoder` | - | deflections by link encoders, at the hips or at all joints |
     | `thormang` | - | what this robot's published controller does: hip roll in single support, feet by IMU and wrench |
     | `talos` | - | the controller, its hip rolls led by their measured torque, as TALOS' published one does |
+    | `iterative` | `input`, offsets learned on this robot before | `adaptive_posture`, likewise: see below |
+    | `iterative:PATH` | what it has learned once, from its folder | the same |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
     | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
     | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |
+
+    `iterative` has a method `rehearse(env, seed)`, which plays the trials that it learns from, each world on its own
+    robot. Until then it is its base. Evaluations call it before they score.
 
     Args:
         name: As in the table.
@@ -87,6 +105,8 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     """
     if name.startswith(RESIDUAL):
         return _residual(Path(name.removeprefix(RESIDUAL)), env, options)
+    if name.startswith(ITERATIVE):
+        return _learned(Path(name.removeprefix(ITERATIVE)), env, options)
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
@@ -111,6 +131,16 @@ def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
         raise ConfigurationError(f"{folder} is a residual for the {description.robot}, the environment is the {task}")
     base = make(description.base, env, **{**description.base_options, **options})
     return residual_policy(folder, base, env.unwrapped.assumed_model)
+
+
+def _learned(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
+    """What `iterative` has learned, around its base, whose options may be given."""
+    description, table = load_table(folder, env)
+    model: RobotModel = env.unwrapped.assumed_model
+    base = make(description.base, env, **options)
+    played = LearnedOffsets(base, model, learned_signals(model, description.learning), PolicyOptions().ramp_s)
+    played.play(table[None])
+    return played
 
 
 def _require_effect(name: str, env: Any, given: Iterable[str], usable: tuple[str, ...]) -> None:

@@ -1,12 +1,10 @@
 """The network of a residual in NumPy, and the tensors that make one."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from safetensors import SafetensorError, safe_open
 
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.signals import Array
@@ -18,8 +16,8 @@ _BLOCK = 32
 """Rows that are multiplied at once: a larger product would be shared out to threads, which then wait busily for more
 work in the way of the physics."""
 _ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
-_MOST_LAYERS, _MOST_BYTES, _LARGEST = 10, 100_000_000, 1e6
-_FILE_TYPES, _TYPES = ("F32", "F64"), ("float32", "float64")
+_MOST_LAYERS, _LARGEST = 10, 1e6
+_TYPES = ("float32", "float64")
 
 
 class NetworkSettings(Protocol):
@@ -39,28 +37,6 @@ class NetworkSettings(Protocol):
     def clip(self) -> float:
         """Bound of normalised features, in standard deviations."""
         ...
-
-
-def read_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Tensors of a file of safetensors.
-
-    Raises:
-        ConfigurationError: It is missing, cut short, too large, something else, or holds other than real numbers.
-    """
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ConfigurationError(f"{path} must have at most {_MOST_BYTES} bytes, it has {path.stat().st_size}")
-        with safe_open(path, framework="np") as file:
-            for name in file.keys():  # noqa: SIM118  no mapping
-                if (kind := file.get_slice(name).get_dtype()) not in _FILE_TYPES:
-                    raise ConfigurationError(
-                        f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {kind}"
-                    )
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise ConfigurationError(
-            f"{path} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
-        ) from None
 
 
 def require_network(tensors: Tensors) -> int:

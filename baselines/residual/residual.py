@@ -15,12 +15,13 @@ from baselines.compensation.policy import Action, ObservationView, Policy, taken
 from baselines.residual.correction import Corrected, ResidualSettings
 from baselines.residual.evidence import caution
 from baselines.residual.features import Features
-from baselines.residual.network import Network, Tensors, read_tensors
+from baselines.residual.network import Network, Tensors
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.json_text import parse_json
 from elastic_env.core.signals import Array
+from elastic_env.core.tensors import read_tensors
 
 RESIDUAL = "residual:"
 """Before the folder of a trained residual, where policies are named."""

@@ -98,12 +98,12 @@ class PostureFeedback:
         integral = np.clip(integral, -most, most)
         turn = gains.proportional * tilt + gains.integral * integral + gains.derivative * rows[:, self._rate]
         turn = self._ramp.share(steps) * np.clip(turn, -gains.limit_rad, gains.limit_rad)
-        total = np.asarray(action, dtype=np.float64) + self._offsets(turn).reshape(np.shape(action))
+        total = np.asarray(action, dtype=np.float64) + hip_offsets(turn).reshape(np.shape(action))
         return total.astype(np.float32), (np.hstack([steps, tilt, integral]), inner)
 
-    @staticmethod
-    def _offsets(turn: Array) -> Array:
-        """Offsets of the joints, (num_worlds, 12) [rad], that turn the pelvis by −roll and −pitch, (num_worlds, 2)."""
-        offsets = np.zeros((len(turn), 2, 6))
-        offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = turn[:, [0]], turn[:, [1]]
-        return offsets.reshape(len(turn), 12)
+
+def hip_offsets(turn: Array) -> Array:
+    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and −pitch, (n, 2) [rad]."""
+    offsets = np.zeros((len(turn), 2, 6))
+    offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = turn[:, [0]], turn[:, [1]]
+    return offsets.reshape(len(turn), 12)

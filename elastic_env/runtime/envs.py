@@ -12,6 +12,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.core.state import Stateful
@@ -117,9 +118,9 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; `options` are not used."""
+        """Begin an episode, with options["robot_seed"] = s of the robot, and motion, that `reset(seed=s)` draws."""
         super().reset(seed=seed, options=options)
-        self._worlds.restart(np.ones(1, dtype=np.bool_), [self.np_random])
+        self._worlds.restart(np.ones(1, dtype=np.bool_), _draws([self.np_random], _robot_seeds(options, 1)))
         self._steps = 0
         self._render_human()
         return self._worlds.task.observe()[0], _first(self._worlds.signals())
@@ -198,15 +199,19 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in every world, or in those of options["reset_mask"]."""
+        """Begin an episode in every world, or in those of options["reset_mask"].
+
+        With options["robot_seed"] = s world i has the robot, and the motion, that `reset(seed=s)` draws for it, under
+        noise and pushes of its own: the same robot walks again. It may be a list, as `seed`, with None for a new one.
+        """
         mask = np.ones(self.num_envs, dtype=np.bool_)
         if options is not None and "reset_mask" in options:
             mask = _checked_mask(options["reset_mask"], self.num_envs)
-        seeds = _seeds(seed, self.num_envs)
+        seeds, robots = _seeds(seed, self.num_envs), _robot_seeds(options, self.num_envs)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
                 self._generators[world] = seeding.np_random(seeds[world])[0]
-        self._begin(mask)
+        self._begin(mask, robots)
         self._is_begun = True
         return self._worlds.task.observe(), self._worlds.signals()
 
@@ -248,8 +253,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         """Free the renderer, let hardware go."""
         self._let_go()
 
-    def _begin(self, worlds: BoolArray) -> None:
-        self._worlds.restart(worlds, self._generators)
+    def _begin(self, worlds: BoolArray, robots: Sequence[int | None] | None = None) -> None:
+        self._worlds.restart(worlds, _draws(self._generators, robots or [None] * self.num_envs))
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
@@ -278,13 +283,25 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         return self._worlds.task.observe(), info
 
 
-def _seeds(seed: Any, num_envs: int) -> list[int | None]:
+def _draws(generators: Sequence[np.random.Generator], robots: Sequence[int | None]) -> list[Draws]:
+    """Generators of new episodes, of new robots or of those that some seeds draw."""
+    return [
+        Draws(own) if seed is None else Draws(seeding.np_random(seed)[0], own)
+        for own, seed in zip(generators, robots, strict=True)
+    ]
+
+
+def _robot_seeds(options: dict[str, Any] | None, num_envs: int) -> list[int | None]:
+    return _seeds((options or {}).get("robot_seed"), num_envs, "options['robot_seed']")
+
+
+def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(num_envs)]
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
-        raise ConfigurationError(f"seed must be a whole number, one per world ({num_envs}), or None; got {seed!r}")
+        raise ConfigurationError(f"{name} must be a whole number, one per world ({num_envs}), or None; got {seed!r}")
     if len(seed) != num_envs:
         raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
     return [None if one is None else int(one) for one in seed]

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
+from elastic_env.core.draws import Draws
 from elastic_env.core.errors import unknown_name
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
 from elastic_env.core.state import Stateful
@@ -151,7 +152,7 @@ class FurtherSensors(Stateful):
         """Whether there is any."""
         return bool(self._sensors)
 
-    def restart(self, worlds: BoolArray, generators: Sequence[np.random.Generator], truth: Measured) -> None:
+    def restart(self, worlds: BoolArray, draws: Sequence[Draws], truth: Measured) -> None:
         """Draw the offsets of new episodes, and measure."""
         if self._noise is None:
             return
@@ -159,8 +160,8 @@ class FurtherSensors(Stateful):
             for name, sensor in self._sensors.items():
                 offset = self._offset[name]
                 width = self._scenario.encoder_bias_rad if sensor.is_encoder else self._scale * sensor.offset
-                offset[world] = width * generators[world].uniform(-1.0, 1.0, offset.shape[1])
-            self._noise.restart(world, np.random.default_rng(generators[world].integers(2**63)))
+                offset[world] = width * draws[world].robot.uniform(-1.0, 1.0, offset.shape[1])
+            self._noise.restart(world, draws[world].noise())
         self.measure(worlds, truth)
         self._before = np.where(worlds[:, None], self._now, self._before)
 

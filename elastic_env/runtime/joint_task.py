@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
@@ -263,15 +264,15 @@ class JointTask(Stateful):
         """Control steps of an episode."""
         return self._reference.num_steps
 
-    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
         """Place the robot at rest under zero offset: the servos hold q_ref, the springs are already deflected."""
         scenario, n = self.config.scenario, len(self._joints)
         for world in np.flatnonzero(worlds).tolist():
-            generator = generators[world]
+            generator = draws[world].robot
             self._reference.draw(world, generator)
             self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
             self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
-            self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
+            self._noise.restart(world, draws[world].noise())
         self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
         self._follow()
         self._offset[worlds] = self._offset_before[worlds] = 0.0
@@ -287,7 +288,7 @@ class JointTask(Stateful):
         if self._sensors:
             simulation.refresh(worlds)
             self._feel(simulation)
-            self._sensors.restart(worlds, generators, self.truth())
+            self._sensors.restart(worlds, draws, self.truth())
 
     def command(self, offset: Array, inputs: Array) -> None:
         """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import mujoco
-import numpy as np
 
+from elastic_env.core.draws import Draws
 from elastic_env.core.signals import Array, BoolArray, Signals, SignalTable
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import Simulation
@@ -57,8 +57,8 @@ class Task(Protocol):
         """Control steps of an episode that does not fail."""
         ...
 
-    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
-        """Begin new episodes in some worlds, a (num_worlds,) mask; one generator for every world of the batch."""
+    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
+        """Begin new episodes in some worlds, a (num_worlds,) mask; one of `draws` for every world of the batch."""
         ...
 
     def command(self, offset: Array, inputs: Array) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from elastic_env.core.compiled import compile_now, compiled
+from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ActionError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, Signals
@@ -90,11 +91,11 @@ class Worlds(Stateful):
         """Number of worlds."""
         return self.task.num_worlds
 
-    def restart(self, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
-        """Begin new episodes in some worlds, a (num_worlds,) mask, each from its own generator."""
+    def restart(self, worlds: BoolArray, draws: Sequence[Draws]) -> None:
+        """Begin new episodes in some worlds, a (num_worlds,) mask, each from its own generators."""
         self.score_samples()
         self.simulation.restart(worlds)
-        self.task.restart(self.simulation, worlds, generators)
+        self.task.restart(self.simulation, worlds, draws)
         self._metrics.restart(worlds)
 
     def signals(self) -> Signals:

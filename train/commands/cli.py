@@ -1,4 +1,4 @@
-"""The command `elastic`: identify, evaluate, compare, train, export, bench, speed, play, hardware, demo."""
+"""The command `elastic`: identify, evaluate, compare, train, iterate, export, bench, speed, play, hardware, demo."""
 
 import contextlib
 import math
@@ -18,7 +18,7 @@ from rich.markup import escape
 
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
-from train.commands.learning import Export, Train
+from train.commands.learning import Export, Iterate, Train
 from train.commands.playing import Compare, Demo, Evaluate, Identify, Play
 from train.runs.failures import DEFECT, explained
 
@@ -27,6 +27,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Iterate, tyro.conf.subcommand("iterate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Speed, tyro.conf.subcommand("speed")]

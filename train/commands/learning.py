@@ -1,4 +1,4 @@
-"""Commands that make residuals: train, export."""
+"""Commands that learn: train, export, iterate."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ import tyro
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from train.commands.options import CONSOLE, options_named
+from train.commands.options import CONSOLE, DEFAULT_SCENARIO, motion, options_named
 
 
 @dataclass
@@ -88,3 +88,46 @@ class Export:
         with own_folder(self.model.stem, self.output) as folder:
             export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
         CONSOLE.print(f"play it as residual:{folder}", soft_wrap=True)
+
+
+@dataclass
+class Iterate:
+    """Learn on the robot itself, from walk to walk: iterative learning control, without any training in simulation.
+
+    After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on the testbed the IMU
+    of the link, have shown at the same time. Prints a table trial by trial; trial 0 is the base, the last one has all
+    that was learned. Writes the learned offsets as a policy iterative:FOLDER, trials.csv and a picture.
+
+    Example: elastic iterate --scenario soft --trials 10
+
+    Example, one joint: elastic iterate --env testbed --reference sine --scenario soft
+    """
+
+    env: str = "walker"
+    """Environment: walker, testbed, or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
+    scenario: str = DEFAULT_SCENARIO
+    """Scenario, see elastic evaluate --help."""
+    reference: str | None = None
+    """Motion, as in elastic evaluate; it must be the same in every trial."""
+    trials: int = 10
+    """Trials that it learns from."""
+    base: str | None = None
+    """Policy whose offsets are learned; default adaptive_posture, on the testbed input."""
+    seed: int = 0
+    """Seed of the robot, where the scenario draws one."""
+    robots: int = 1
+    """Robots, each of which learns by itself; their seeds follow --seed."""
+    output: Path | None = None
+    """Folder for the run, new or empty; default runs/iterate, numbered if taken."""
+
+    def run(self) -> None:
+        """Learn."""
+        from baselines.adaptation.learned_signals import LearningGains
+        from train.experiments.iterate import IterateConfig, iterate
+
+        with options_named():
+            config = IterateConfig(
+                env=self.env, scenario=self.scenario, reference=motion(self.env, self.reference), base=self.base,
+                learning=LearningGains(trials=self.trials), seed=self.seed, robots=self.robots,
+            )  # fmt: skip
+        iterate(config, CONSOLE, self.output)

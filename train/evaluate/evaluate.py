@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.identification.static_points import HoldRecorder, StaticPoints
+from baselines.policies import is_saved
 from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.runtime.robot_model import WalkerModel
@@ -82,7 +83,7 @@ def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = Non
         ConfigurationError: The name is neither a baseline nor an importable function.
     """
     options = spec.options if options is None else options
-    if ":" not in spec.name or spec.name.startswith(baselines.RESIDUAL):
+    if ":" not in spec.name or is_saved(spec.name):
         return baselines.make(spec.name, env, **options)
     try:
         function = named_object(spec.name)
@@ -154,6 +155,9 @@ def _worlds_at_once(condition: Condition) -> int:
 def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
     """Play all episodes of a condition. Episode i has seed + i, whatever the number of worlds and threads.
 
+    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it may play episodes of
+    the robots that it is scored on, under other noise, see `baselines.adaptation.iterative`.
+
     Args:
         condition: What to play.
         progress: Called with the number of control steps done since the last call.
@@ -182,6 +186,9 @@ def _play_in(
     env: Any, condition: Condition, first: int, worlds: int, result: Evaluation, progress: Progress | None
 ) -> None:
     policy = make_policy(condition.policy, env, condition.policy_options)
+    if hasattr(policy, "rehearse"):
+        with _blamed(condition, 0):
+            policy.rehearse(env, condition.seed + first)
     task = env.unwrapped.task
     keeper = _FirstWorld(task, condition.environment.traced) if first == 0 else None
     is_scored = hasattr(policy, "link_estimate") and not condition.environment.is_real

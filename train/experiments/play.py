@@ -12,7 +12,7 @@ from rich.progress import track
 
 from elastic_env.core.errors import ElasticError, ResultsExistError, missing_extra
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import make_policy
+from train.evaluate.evaluate import make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
 
@@ -38,14 +38,27 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     steps = task.num_steps if max_s is None else max(round(min(max_s / period, task.num_steps)), 1)
-    episode = _episode(env, make_policy(condition.policy, env), condition.seed, steps, console)
     try:
+        policy = make_policy(condition.policy, env)
+        if hasattr(policy, "rehearse"):
+            _rehearse(policy, condition, console)
+        episode = _episode(env, policy, condition.seed, steps, console)
         if video is None:
             _window(episode, period)
         else:
             _film(env, episode, steps, period, video, console)
     finally:
         env.close()
+
+
+def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
+    """Let a policy learn on the robot, out of sight."""
+    console.print(f"{condition.policy.title} learns on this robot first", soft_wrap=True)
+    unseen = make_vector_env(condition, 1)
+    try:
+        policy.rehearse(unseen, condition.seed)
+    finally:
+        unseen.close()
 
 
 def _episode(env: Any, policy: Any, seed: int, steps: int, console: Console) -> Iterator[int]:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from elastic_env.core.draws import Draws
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.testbed.plant import ServoPlant
@@ -71,9 +72,9 @@ class HardwareTestbedTask(TestbedTask):
                 "the limits"
             )
 
-    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
         """Drive the testbed to its start and let it settle under zero offset."""
-        self._reference.draw(0, generators[0])
+        self._reference.draw(0, draws[0].robot)
         self._step = np.zeros(1, dtype=np.int64)
         self._offset, self._offset_before = np.zeros((2, 1, 1))
         self._follow()

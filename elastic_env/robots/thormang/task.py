@@ -59,6 +59,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from elastic_env.core.compiled import compile_now
+from elastic_env.core.draws import Draws
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
 from elastic_env.core.state import Stateful
 from elastic_env.dynamics import walk_kernels as kernels
@@ -182,7 +183,7 @@ class WalkTask(Stateful):
         self._phases.flags.writeable = False
         self._is_compiled = False
 
-    def restart(self, simulation: Simulation, worlds: BoolArray, generators: Sequence[np.random.Generator]) -> None:
+    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
         """Place robots in static equilibrium under zero offset."""
         scenario = self.config.scenario
         simulation.views(kernels.Physics._fields)
@@ -195,11 +196,11 @@ class WalkTask(Stateful):
         truth["offset"][worlds], truth["command_rate"][worlds] = 0.0, 0.0
         truth["command"][worlds] = self.plan.q[0]
         for world in np.flatnonzero(worlds).tolist():
-            generator = generators[world]
+            generator = draws[world].robot
             self._draw[world] = generator.integers(len(self._bank))
             self._bias["imu_attitude"][world] = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
-            self._draw_push(world, generator)
-            self._noise.restart(world, np.random.default_rng(generator.integers(2**63)))
+            self._draw_push(world, draws[world])
+            self._noise.restart(world, draws[world].noise())
             truth["stiffness"][world] = self._place(simulation, world)
             self._draw_imu(world, generator)
         simulation.refresh(worlds)
@@ -210,7 +211,7 @@ class WalkTask(Stateful):
         self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
         self._shown = np.where(worlds, rows, self._shown)
         if self._sensors:
-            self._sensors.restart(worlds, generators, self._felt(simulation))
+            self._sensors.restart(worlds, draws, self._felt(simulation))
 
     def _rehearse(self, simulation: Simulation) -> None:
         """Call all kernels on rows of their own."""
@@ -362,11 +363,11 @@ class WalkTask(Stateful):
         """Noise of the sensors ahead."""
         return kernels.Noise(*self._noise.ready())
 
-    def _draw_push(self, world: int, generator: np.random.Generator) -> None:
+    def _draw_push(self, world: int, draws: Draws) -> None:
         """Time and direction of the push, in the walk."""
         walking = np.flatnonzero(self.plan.timing.walking)
-        begin = generator.integers(walking[0], walking[-1] + 1)
-        direction = generator.uniform(0.0, 2.0 * np.pi)
+        begin = draws.of_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
+        direction = draws.of_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
         self._push_begin[world] = begin
         self._push_force[world] = self.config.scenario.push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
 

@@ -1,0 +1,209 @@
+"""A policy whose offsets are learned from trial to trial on the robot itself, see `iterative_learning`.
+
+It needs no simulation, no model beside that of its base, and no truth: the trials are episodes of the environment that
+it is given, which may be hardware. What it has learned is a table of offsets over the time of an episode.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from baselines.adaptation.iterative_learning import credible, updated
+from baselines.adaptation.learned_signals import LearnedSignals
+from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from baselines.compensation.startup import Ramp
+from elastic_env.core.errors import ElasticError
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.runtime.robot_model import RobotModel
+
+_RETREAT = 0.5
+"""Share of the offsets that is kept after a trial that failed, such as by a fall."""
+
+
+class LearnedOffsets:
+    """Any policy with a table of offsets added, row by row from the start of an episode.
+
+    Memory per world: control steps since the start, then that of the policy.
+
+    Args:
+        policy: What commands the robot.
+        model: Assumed robot.
+        signals: What the columns of the table are.
+        ramp_s: Time in which the offsets grow from zero [s].
+
+    Attributes:
+        tables: What was learned, for every world or for all of them alike, (num_worlds or 1, T, k).
+    """
+
+    def __init__(self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float) -> None:
+        self._policy, self._signals, self._ramp = policy, signals, Ramp(model, ramp_s)
+        self._period_s = model.control_period_s
+        self._view = ObservationView(model.observation_table, self._period_s)
+        self._n = len(model.joint_names)
+        self.tables = np.zeros((1, 1, len(signals.names)))
+        self._offsets = np.zeros((1, 1, self._n))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns, with their unit."""
+        return self._signals.names
+
+    def play(self, tables: Array) -> None:
+        """Take other offsets, (num_worlds or 1, T, k); row t acts in the period that ends t periods after the start."""
+        share = self._ramp.share(np.arange(tables.shape[1], dtype=np.float64))[:, None]
+        self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
+        self.tables = tables
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Action and new state."""
+        rows = self._view.rows(observation)
+        begun = np.zeros((len(rows), 1))
+        steps, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
+        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
+        steps = steps + 1.0
+        total = np.asarray(action, dtype=np.float64) + self._at(steps[:, 0]).reshape(np.shape(action))
+        return total.astype(np.float32), (steps, inner)
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angles that the policy saw, (..., n) [rad]."""
+        return self._policy.link_estimate(observation, state[1])  # type: ignore[attr-defined]
+
+    def _at(self, steps: Array) -> Array:
+        """Offsets at a control step of every world, (num_worlds, n) [rad]; behind the table its last row."""
+        tables, row = len(self._offsets), np.minimum(steps.astype(np.int64), self._offsets.shape[1] - 1)
+        if tables not in (1, len(steps)):
+            raise ElasticError(f"the offsets were learned in {tables} worlds, one each, and are played in {len(steps)}")
+        return self._offsets[np.arange(len(steps)) if tables > 1 else 0, row]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of a trial.
+
+    Attributes:
+        number: Of the trial, 0 for the first, which has no offsets yet.
+        error: Measured errors, (num_worlds, T, k); nan where there is none.
+        failed: Worlds whose trial ended before its time, (num_worlds,).
+        metrics: Metrics of every world's episode, for people: nothing is learned of them.
+    """
+
+    number: int
+    error: Array
+    failed: BoolArray
+    metrics: Sequence[Mapping[str, float]]
+
+    @property
+    def error_rms(self) -> Array:
+        """Root mean squares over the time, (num_worlds, k)."""
+        return np.sqrt(np.nanmean(np.square(self.error), axis=1))
+
+
+class IterativeLearner(LearnedOffsets):
+    """`LearnedOffsets` that learns them before it is scored; each world learns on its own robot.
+
+    Args:
+        policy: What commands the robot.
+        model: Assumed robot.
+        signals: Errors, offsets, gains.
+        trials: How many it learns from.
+        ramp_s: Time in which the offsets grow from zero [s].
+    """
+
+    def __init__(self, policy: Policy, model: RobotModel, signals: LearnedSignals, trials: int, ramp_s: float) -> None:
+        super().__init__(policy, model, signals, ramp_s)
+        self.trials = trials
+
+    def rehearse(self, env: Any, seed: int, told: Callable[[Trial], None] | None = None) -> None:
+        """Learn in an environment, on the robots that its `reset(seed=seed)` draws; what was learned before is dropped.
+
+        Args:
+            env: The environment that the policy was made for, scalar or vector.
+            seed: World i has the robot of seed + i, in every trial with other noise.
+            told: Called after each trial.
+        """
+        stage = Stage(env, seed)
+        shape = (stage.num_worlds, stage.num_steps + 1, len(self._signals.names))
+        tables, before = np.zeros(shape), np.full(shape, np.inf)
+        for number in range(self.trials):
+            self.play(tables)
+            trial = stage.trial(self, self._signals, number)
+            tables, before = self._learned(tables, before, trial)
+            if told is not None:
+                told(trial)
+        self.play(tables)
+
+    def _learned(self, tables: Array, before: Array, trial: Trial) -> tuple[Array, Array]:
+        """Tables of the next trial, and what was credible of the errors."""
+        surprise = np.array([gains.surprise for gains in self._signals.gains])
+        # where nothing came before, all is credible
+        known = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
+        error = credible(trial.error, known, surprise)
+        following = np.stack(
+            [updated(*pair, self._signals.gains, self._period_s) for pair in zip(tables, error, strict=True)]
+        )
+        failed = trial.failed[:, None, None]
+        return np.where(failed, _RETREAT * tables, following), np.where(failed, before, error)
+
+
+class Stage:
+    """An environment in which the same robots do trial after trial.
+
+    Args:
+        env: It, scalar or vector.
+        seed: World i has the robot of seed + i.
+    """
+
+    def __init__(self, env: Any, seed: int) -> None:
+        count = getattr(env.unwrapped, "num_envs", None)
+        self._env, self._is_scalar, self.num_worlds = env, count is None, count or 1
+        self.num_steps: int = env.unwrapped.task.num_steps
+        self._robots = [seed + world for world in range(self.num_worlds)]
+
+    def trial(self, policy: Policy, signals: LearnedSignals, number: int) -> Trial:
+        """Play an episode in every world. Its noise depends on the robot's seed and the number of the trial alone."""
+        n = self.num_worlds
+        seeds = [_seed_of_noise(robot, number) for robot in self._robots]
+        seen = self._reset(seeds)
+        error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
+        over, failed, state = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), None
+        metrics: list[Mapping[str, float]] = [{}] * n
+        start = np.ones(n, dtype=np.bool_)
+        for step in range(1, self.num_steps + 1):
+            action, state = policy.predict(seen, state=state, episode_start=start, deterministic=True)
+            asked = seen
+            seen, terminated, truncated, info = self._step(action)
+            start = terminated | truncated
+            running = ~over & ~terminated
+            error[running, step] = signals.error(asked, seen, info)[running]
+            for world in np.flatnonzero(start & ~over).tolist():
+                metrics[world] = {name: float(value) for name, value in self._metrics_of(info, world)}
+            over, failed = over | start, failed | (terminated & ~over)
+            if over.all():
+                break
+        return Trial(number, error, failed, metrics)
+
+    def _reset(self, seeds: list[int]) -> Array:
+        if self._is_scalar:
+            return self._env.reset(seed=seeds[0], options={"robot_seed": self._robots[0]})[0][None]
+        return self._env.reset(seed=seeds, options={"robot_seed": self._robots})[0]
+
+    def _step(self, action: Array) -> tuple[Array, BoolArray, BoolArray, Mapping[str, Any]]:
+        seen, _, terminated, truncated, info = self._env.step(action[0] if self._is_scalar else action)
+        if self._is_scalar:
+            return seen[None], np.array([terminated]), np.array([truncated]), info
+        return seen, terminated, truncated, info
+
+    def _metrics_of(self, info: Mapping[str, Any], world: int) -> Iterator[tuple[str, float]]:
+        """Metrics of a world whose episode has just ended."""
+        for name, values in info.get("final_info", info)["episode_metrics"].items():
+            yield name, values if self._is_scalar else values[world]
+
+
+def _seed_of_noise(robot: int, number: int) -> int:
+    """Seed of a trial's noise, other than that of any other trial and of the robot's own episode."""
+    sequence = np.random.SeedSequence([robot, number])
+    return int(sequence.generate_state(1, np.uint64)[0] >> 1)

@@ -1,0 +1,93 @@
+r"""Iterative learning control: what went wrong in a trial corrects the offsets of the next one, at the same time.
+
+.. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
+
+u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j. γ is the learning
+gain. A share λ is forgotten, so that noise does not add up where the plant hardly answers. The lead ℓ makes up for the
+delay from an offset to its effect. Q is a low-pass filter without phase shift, which stops learning where the delay is
+not known well enough [Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where, at
+all frequencies,
+
+.. math:: | Q \, (1 - \lambda - \gamma \, e^{i \omega \ell} P) | < 1
+
+[Bristow2006]; the wrong sign of γ diverges. With Q = 1, λ = 0 and P = p it is e_j = (1 − γ p)^j e_0.
+
+A push in one trial is no error of the robot. So an error may shrink by any amount from one trial to the next, but it
+counts as grown, or as turned over, by no more than a surprise.
+
+[Bristow2006] D. A. Bristow, M. Tharayil, A. G. Alleyne, "A Survey of Iterative Learning Control", IEEE Control Systems
+Magazine 26(3).
+[Longman2000] R. W. Longman, "Iterative Learning Control and Repetitive Control for Engineering Practice", International
+Journal of Control 73(10).
+[Elci2002] H. Elci, R. W. Longman, M. Q. Phan, J.-N. Juang, R. Ugoletti, "Simple Learning Control Made Practical by
+Zero-Phase Filtering: Applications to Robotics", IEEE Trans. Circuits and Systems I 49(6).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import signal
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+
+_ORDER = 2  # of the filter, which acts twice
+
+
+class ChannelGains(Model):
+    """How one error, in its own unit, corrects its offset."""
+
+    gain: float = quantity("offset/error", ge=0, description="learning gain γ")
+    lead_s: float = quantity("s", ge=0, le=1, description="lead ℓ: delay from an offset to its effect")
+    cutoff_hz: float = quantity("Hz", gt=0, le=100, description="frequency at which Q halves the amplitude")
+    surprise: float = quantity("error", gt=0, description="by how much an error can grow from trial to trial")
+    limit: float = quantity("offset", gt=0, description="largest offset")
+    forgetting: float = quantity("1", 0.0, ge=0, lt=1, description="share λ of the offset that is forgotten")
+
+
+def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
+    """Q: a low-pass filter that runs forwards and backwards in time, so that it shifts no phase.
+
+    Args:
+        table: Values over time, (T, ...).
+        cutoff_hz: Where the amplitude is halved [Hz].
+        period_s: Time between rows [s].
+    """
+    sections = signal.butter(_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
+    longest = round(1.0 / (cutoff_hz * period_s))  # a period of the cutoff at both ends
+    return signal.sosfiltfilt(sections, table, axis=0, padlen=min(longest, len(table) - 1))
+
+
+def ahead(error: Array, steps: int) -> Array:
+    """The error some steps later at every step, (T, ...); its last value behind the end."""
+    return np.concatenate([error[steps:], np.repeat(error[-1:], min(steps, len(error)), axis=0)])[: len(error)]
+
+
+def credible(error: Array, before: Array, surprise: float | Array) -> Array:
+    """An error as far as that of the trial before makes it credible, elementwise.
+
+    Args:
+        error: Of this trial, nan where it was not measured, which counts as none.
+        before: What was credible in the trial before.
+        surprise: By how much an error can grow, in its unit.
+    """
+    low, high = np.minimum(before, 0.0) - surprise, np.maximum(before, 0.0) + surprise
+    return np.clip(np.nan_to_num(error), low, high)
+
+
+def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float) -> Array:
+    """Offsets of the next trial, see the module.
+
+    Args:
+        table: Offsets of this trial, (T, k), a column for each of the gains.
+        error: What is to be corrected, at the same times, (T, k).
+        gains: Of the columns.
+        period_s: Time between rows [s].
+    """
+    following = np.empty_like(table)
+    for column, own in enumerate(gains):
+        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain * ahead(
+            error[:, column], round(own.lead_s / period_s)
+        )
+        following[:, column] = np.clip(zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit)
+    return following

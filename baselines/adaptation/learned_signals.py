@@ -1,0 +1,135 @@
+r"""What is learned from trial to trial: which measured errors, and which offsets of the joints correct them.
+
+| robot | error, by sensors alone | correction |
+|---|---|---|
+| walker | roll and pitch of the IMU | the same offset on both hip rolls, or on both hip pitches |
+| walker | planned less measured ZMP | another ZMP of the plan, see `baselines.walking.zmp_shift` |
+| joints | q_ref − q by link encoders, or by the IMU of the only link | the offset of the joint |
+
+A positive offset of both hip rolls turns the pelvis to a negative roll, so the error is the roll itself. The ZMP and
+the links follow their offsets, so their error is what was asked less what was measured.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from baselines.adaptation.iterative_learning import ChannelGains
+from baselines.compensation.measured import LINK_ENCODER
+from baselines.walking.posture import hip_offsets
+from baselines.walking.zmp_shift import zmp_shift_offsets
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.ground_contact import zero_moment_point
+from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+
+LINK_IMU = "link_angle_imu"
+_LEAST_LOAD = 0.15  # share of the weight below which there is no ZMP
+
+
+class LearningGains(Model):
+    """How the offsets of `iterative` are learned."""
+
+    trials: int = quantity("1", 10, ge=1, le=1000, description="trials, such as walks, that it learns from")
+    attitude: ChannelGains = ChannelGains(gain=2.0, lead_s=0.032, cutoff_hz=6.0, surprise=1.5e-3, limit=0.08)
+    """Walker: hip angle per tilt of the pelvis [1], in rad."""
+    zmp: ChannelGains = ChannelGains(gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1)
+    """Walker: shift of the planned ZMP per deviation of the ZMP [1], in m."""
+    joint: ChannelGains = ChannelGains(gain=0.5, lead_s=0.08, cutoff_hz=1.4, surprise=0.01, limit=0.2)
+    """Robots on a fixed base: offset per error of the link [1], in rad."""
+
+
+class LearnedSignals(Protocol):
+    """Errors that are corrected, and how."""
+
+    names: tuple[str, ...]
+    """Of the columns, with their unit."""
+    gains: tuple[ChannelGains, ...]
+    """Of the columns."""
+
+    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
+        """What was measured after a control step, (num_worlds, k); nan where nothing was.
+
+        Args:
+            asked: Observations before the step, whose reference is that of its end, (num_worlds, m).
+            seen: Observations after it.
+            info: What the environment says of it.
+        """
+        ...
+
+    def offsets(self, table: Array) -> Array:
+        """Offsets of the joints for a table over time, (T, k) to (T, n) [rad]."""
+        ...
+
+
+class WalkSignals:
+    """Attitude and ZMP of a walker, see the module.
+
+    Args:
+        model: Assumed walker.
+        gains: How they are learned.
+    """
+
+    names: tuple[str, ...] = ("roll_rad", "pitch_rad", "zmp_x_m", "zmp_y_m")
+
+    def __init__(self, model: WalkerModel, gains: LearningGains) -> None:
+        self.gains = (gains.attitude, gains.attitude, gains.zmp, gains.zmp)
+        self._model, table = model, model.observation_table
+        self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
+        self._zmp = table.group("zmp_reference")
+
+    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:  # noqa: ARG002  the interface's
+        """See `LearnedSignals`; of the ZMP as if the feet were flat where they are planned."""
+        return np.hstack([seen[:, self._attitude], asked[:, self._zmp] - self.measured_zmp(seen)])
+
+    def measured_zmp(self, seen: Array) -> Array:
+        """ZMP by the foot sensors, (num_worlds, 2) [m]; nan where the feet carry almost nothing."""
+        biped, n = self._model.biped, len(seen)
+        flat = np.broadcast_to(np.eye(3), (n, 2, 3, 3))
+        force, moment = biped.foot_sensors.ground_wrench(seen[:, self._wrench].reshape(n, 2, 2, 3), flat)
+        return zero_moment_point(force, moment, biped.ankles, _LEAST_LOAD * biped.weight)
+
+    def offsets(self, table: Array) -> Array:
+        """See `LearnedSignals`."""
+        return hip_offsets(table[:, :2]) + zmp_shift_offsets(self._model, table[:, 2:])
+
+
+class JointSignals:
+    """Links of a robot on a fixed base, see the module.
+
+    Args:
+        model: Assumed robot.
+        gains: How they are learned.
+
+    Raises:
+        ConfigurationError: Nothing shows its links.
+    """
+
+    def __init__(self, model: RobotModel, gains: LearningGains) -> None:
+        joints, table = model.joint_names, model.observation_table
+        self.names = tuple(f"{joint}_rad" for joint in joints)
+        self.gains = (gains.joint,) * len(joints)
+        self._reference = table.group("reference_angle")
+        has_encoders = LINK_ENCODER in {name.split(".")[0] for name in table.names}
+        self._encoder = table.group(LINK_ENCODER) if has_encoders else None
+        if self._encoder is None and len(joints) > 1:
+            raise ConfigurationError(
+                f"learning the offsets of {len(joints)} joints needs their links measured; make the environment with "
+                f"sensors=[{LINK_ENCODER!r}]"
+            )
+
+    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
+        """See `LearnedSignals`."""
+        link = np.reshape(info[LINK_IMU], (-1, 1)) if self._encoder is None else seen[:, self._encoder]
+        return asked[:, self._reference] - link
+
+    def offsets(self, table: Array) -> Array:
+        """See `LearnedSignals`."""
+        return table
+
+
+def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
+    """What is learned of a robot."""
+    return WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)

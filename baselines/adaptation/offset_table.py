@@ -1,0 +1,138 @@
+"""What `iterative` has learned, as a folder: `iterative.json` and `offsets.safetensors`.
+
+The table has a row for every control step of the motion and a column for every learned signal, in SI units. Loading it
+runs no code from it. It plays in an environment of the same robot, motion and control period alone.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field, field_validator
+from safetensors.numpy import save
+
+from baselines.adaptation.learned_signals import LearningGains
+from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
+from elastic_env.core.config_problems import ModelError
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.json_text import parse_json
+from elastic_env.core.signals import Array
+from elastic_env.core.tensors import read_tensors
+
+DESCRIPTION, OFFSETS = "iterative.json", "offsets.safetensors"
+_TENSOR, _LARGEST = "offsets", 1.0
+
+
+class TableDescription(Model):
+    """What `iterative.json` says of the table beside it."""
+
+    robot: Title
+    """Task of the environment, walker or testbed."""
+    base: Title
+    """Name of the policy that the offsets are added to."""
+    learning: LearningGains = LearningGains()
+    signals: list[Title] = Field(min_length=1, max_length=MOST_ENTRIES)
+    """Learned signals with their unit, one per column."""
+    motion: dict[str, Any]
+    """Gait or reference, which has to be that of the environment."""
+    control_period_s: float = quantity("s", gt=0, description="time between rows")
+    scenario: Title
+    """That it was learned in."""
+    training: dict[str, Any] = {}
+    """Seed of the robot, commit, versions."""
+
+    @field_validator("base")
+    @classmethod
+    def _base_is_a_name(cls, value: str) -> str:
+        if ":" in value or value == "iterative":
+            raise ValueError(f"the base must be a baseline that has learned nothing, got {value!r}")
+        return value
+
+
+def motion_of(env: Any) -> dict[str, Any]:
+    """Gait or reference of an environment."""
+    config = env.unwrapped.task.config
+    return (config.gait if hasattr(config, "gait") else config.reference).model_dump(mode="json")
+
+
+def save_table(folder: Path, description: TableDescription, table: Array) -> None:
+    """Write a table, (T, k), that `load_table` reads.
+
+    Raises:
+        ConfigurationError: A table that is none.
+    """
+    _require_table(description, table)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / OFFSETS).write_bytes(save({_TENSOR: np.ascontiguousarray(table)}))
+    (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def read_table_description(folder: Path) -> TableDescription:
+    """What a table says of itself.
+
+    Raises:
+        ConfigurationError: There is none, or it is not valid.
+    """
+    path = folder / DESCRIPTION
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(
+            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed "
+            f"({error.strerror}), as `elastic iterate` writes it"
+        ) from None
+    except ValueError as error:
+        raise ConfigurationError(f"{path} is not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{path} must be a mapping, got {type(content).__name__}")
+    try:
+        return TableDescription(**content)
+    except ModelError as error:
+        raise ConfigurationError(f"{path} describes no table: {error.named()}") from None
+
+
+def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
+    """A table for an environment, (T, k).
+
+    Raises:
+        ConfigurationError: There is none, it is damaged, or it was learned for something else.
+    """
+    description, tensors = read_table_description(folder), read_tensors(folder / OFFSETS)
+    if set(tensors) != {_TENSOR}:
+        raise ConfigurationError(f"{folder / OFFSETS} must hold one tensor, {_TENSOR!r}, got {shown(sorted(tensors))}")
+    table = np.asarray(tensors[_TENSOR], dtype=np.float64)
+    try:
+        _require_table(description, table)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{folder / OFFSETS}: {error}") from None
+    _require_same(folder, description, table, env)
+    return description, table
+
+
+def _require_table(description: TableDescription, table: Array) -> None:
+    k = len(description.signals)
+    if table.ndim != 2 or table.shape[1] != k or len(table) < 2:
+        raise ConfigurationError(f"the table must have the shape (T, {k}) with T >= 2, got {table.shape}")
+    if not np.isfinite(table).all() or np.abs(table).max() > _LARGEST:
+        raise ConfigurationError(f"offsets must be finite and within ±{_LARGEST:g} rad or m")
+
+
+def _require_same(folder: Path, description: TableDescription, table: Array, env: Any) -> None:
+    """Refuse a table of another robot or motion."""
+    task = env.unwrapped.task
+    pairs = (
+        ("robot", description.robot, task.name),
+        ("control period", description.control_period_s, task.assumed_model.control_period_s),
+        ("number of rows", len(table), task.num_steps + 1),
+    )
+    for what, learned, given in pairs:
+        if learned != given:
+            raise ConfigurationError(f"{folder} was learned with the {what} {learned!r}, the environment has {given!r}")
+    motion = motion_of(env)
+    for key in {**motion, **description.motion}:
+        learned, given = description.motion.get(key), motion.get(key)
+        if learned != given:
+            raise ConfigurationError(
+                f"{folder} was learned for a motion with {key} {shown(learned)}, the environment has {shown(given)}; "
+                "learn it anew: offsets of one motion are wrong in another"
+            )
