@@ -10,7 +10,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.catalogue import ON_THE_WALKER
+from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.compensation.oracle import Oracle
@@ -269,7 +269,7 @@ def test_unknown_names_are_told_those_of_the_robot() -> None:
         with pytest.raises(ConfigurationError, match=rf"unknown policy of the testbed '{name}'") as caught:
             baselines.make(name, testbed)
         choices = str(caught.value).split(f"'{name}'")[1]
-        assert "zero, uncompensated, input, dynamic, oracle" in choices
+        assert f"choose one of: {', '.join(ON_JOINTS)}, residual:PATH" in choices
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "oracle"])
