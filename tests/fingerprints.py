@@ -21,13 +21,19 @@ import numpy as np
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.policies import policy_names
 from elastic_env.runtime.scenario import scenario_names
 
 RECORDED = Path(__file__).with_name("fingerprints.json")
 STEPS, WORLDS = 300, 7
-WALKER_ALONE = ("uncompensated_open", "input_open", "input_output", "input_wrench")
-RESIDUALS = {"testbed": ("testbed/seed_0",), "walker": ("walker_3s/seed_0", "walker_1600ms/seed_0")}
+_ON_JOINTS = ("zero", "uncompensated", "input", "dynamic", "oracle")
+POLICIES = {
+    "testbed": (*_ON_JOINTS, "residual:testbed/seed_0"),
+    "walker": (
+        *_ON_JOINTS, "uncompensated_open", "input_open", "input_output", "input_wrench", "residual:walker_3s/seed_0",
+        "residual:walker_1600ms/seed_0",
+    ),
+}  # fmt: skip
+"""Policies that were there when the first record was made."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +64,8 @@ def cases() -> list[Case]:
     """Every scenario with one policy, every policy in one scenario, and whole short episodes."""
     found = []
     for env, own in (("testbed", "input"), ("walker", "input_output")):
-        policies = [*policy_names(), *(f"residual:{name}" for name in RESIDUALS[env])]
-        known = [policy for policy in policies if env == "walker" or policy not in WALKER_ALONE]
         pairs = [(own, scenario) for scenario in scenario_names(walks=env == "walker")]
-        pairs += [(policy, "nominal") for policy in known if policy != own]
+        pairs += [(policy, "nominal") for policy in POLICIES[env] if policy != own]
         found += [Case(env, policy, scenario, worlds) for policy, scenario in pairs for worlds in (1, WORLDS)]
     sine, walk = '{"reference": {"kind": "sine", "duration_s": 1.0}}', '{"step_period": 1.1, "num_steps": 1}'
     whole = [
@@ -69,7 +73,9 @@ def cases() -> list[Case]:
         ("walker", "zero", "ideal", walk),
         ("walker", "input", "soft", walk),
     ]
-    return found + [Case(*names, worlds, arguments) for *names, arguments in whole for worlds in (1, WORLDS)]
+    return found + [
+        Case(env, policy, scenario, n, arguments) for env, policy, scenario, arguments in whole for n in (1, WORLDS)
+    ]
 
 
 _IDS = {"testbed": "elastic_env/Testbed-v0", "walker": "elastic_env/WalkInPlace-v0"}
