@@ -80,7 +80,8 @@ def begin(physics: Any, walker: Any, noise: Any, worlds: BoolArray, rows: Any) -
             truth, shown = rows[world].truth, rows[world].measured
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            measure(truth, sample_of(noise, world), walker.bias[world], constants.quality, True, shown)
+            imu_is_due = row_of(walker.plan, truth.step).imu_is_due  # as always at first
+            measure(truth, sample_of(noise, world), walker.bias[world], constants.quality, imu_is_due, shown)
             shown.encoder_before[:] = shown.encoder
 
 
