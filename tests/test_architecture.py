@@ -74,7 +74,8 @@ ROOMS = [
     "elastic_env.hardware", "elastic_env.hardware.servo_bus", "elastic_env.hardware.safety", "elastic_env.hardware.imu",
     "elastic_env.hardware.testbed", "elastic_env.hardware.emulator", "elastic_env",
     "baselines.compensation", "baselines.walking", "baselines.estimation", "baselines.adaptation",
-    "baselines.identification", "baselines.residual", "baselines.policies", "baselines.residual_env", "baselines",
+    "baselines.identification", "baselines.residual", "baselines.options", "baselines.catalogue", "baselines.policies",
+    "baselines.residual_env", "baselines",
     "train.runs", "train.evaluate", "train.figures", "train.report", "train.learn", "train.experiments", "train.speed",
     "train.hardware", "train.commands", "train",
 ]  # fmt: skip
