@@ -68,6 +68,7 @@ from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
+from elastic_env.robots.thormang import NAME
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
@@ -119,7 +120,7 @@ class WalkTask(Stateful):
         "_has_fallen",
     )  # fmt: skip
 
-    name = "walker"
+    name = NAME
     action_table = ACTION
     assumed_model: RobotModel
     metrics: Sequence[Metric] = METRICS
