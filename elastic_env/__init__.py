@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from elastic_env.robots.joint_robot import JointRobot
 
 __version__ = "0.1.0"
-__all__ = ["ElasticJoint", "JointRobot", "Servo", "make_elastic"]
+__all__ = ["IDS", "ElasticJoint", "JointRobot", "Servo", "make_elastic"]
+
+_ENVIRONMENTS = "elastic_env.robots.testbed", "elastic_env.robots.thormang", "elastic_env.hardware.testbed"
+"""Packages that say NAME and ID of an environment, and make it in a module `environment`."""
 
 _HOMES = {
     "ElasticJoint": "elastic_env.joint.elasticity",
@@ -35,9 +38,10 @@ def __getattr__(name: str) -> Any:
 
 
 prefer_egl()
-for _id, _home in {
-    "elastic_env/Testbed-v0": "elastic_env.robots.testbed.environment",
-    "elastic_env/WalkInPlace-v0": "elastic_env.robots.thormang.environment",
-    "elastic_env/HardwareTestbed-v0": "elastic_env.hardware.testbed.environment",
-}.items():
-    gymnasium.register(id=_id, entry_point=f"{_home}:make", vector_entry_point=f"{_home}:make_vector")
+IDS: dict[str, str] = {}
+"""Gymnasium's ids of the environments by their short names."""
+for _home in _ENVIRONMENTS:
+    _room = import_module(_home)
+    IDS[_room.NAME] = _room.ID
+    _made = f"{_home}.environment"
+    gymnasium.register(id=_room.ID, entry_point=f"{_made}:make", vector_entry_point=f"{_made}:make_vector")

@@ -74,7 +74,9 @@ def cases() -> list[Case]:
         ("walker", "zero", "ideal", walk),
         ("walker", "input", "soft", walk),
     ]
-    return found + [Case(*names, worlds, arguments) for *names, arguments in whole for worlds in (1, WORLDS)]
+    return found + [
+        Case(env, policy, scenario, n, arguments) for env, policy, scenario, arguments in whole for n in (1, WORLDS)
+    ]
 
 
 _IDS = {"testbed": "elastic_env/Testbed-v0", "walker": "elastic_env/WalkInPlace-v0"}

@@ -80,7 +80,7 @@ ROOMS = [
     "train.hardware", "train.commands", "train",
 ]  # fmt: skip
 """Folders, and modules beside them, in the order in which they may import: each from those before it."""
-MOST_MODULES = 12
+MOST_MODULES, MOST_PARAMETERS = 12, 7
 
 
 def room_of(name: str) -> str:
@@ -100,6 +100,18 @@ def test_rooms_import_only_from_those_before(file: Path) -> None:
     if own not in ("elastic_env.robots.testbed", "elastic_env.robots.thormang"):
         return
     assert not {room for room in used if room.startswith("elastic_env.robots.")} - {own}, "robots know one another"
+
+
+@pytest.mark.parametrize("file", FILES, ids=identify)
+def test_no_function_has_many_parameters(file: Path) -> None:
+    """Catches arguments that should be one thing; those of `gymnasium.make` alone are named one by one."""
+    many = []
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            if len(set(names) - {"self", "cls"}) > MOST_PARAMETERS:
+                many.append(node.name)
+    assert set(many) <= {"configure_walk", "configure_testbed"}
 
 
 def test_no_folder_is_crowded() -> None:

@@ -190,13 +190,13 @@ def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, m
                 if hasattr(function, "py_func"):
                     uncompiled.setattr(kernels, name, function.py_func)
             assert ran.py_func(*interpreted) == is_over  # type: ignore[attr-defined]
-        _, rows, outcome = arguments[-3:]
-        _, plain_rows, plain = interpreted[-3:]
+        (rows, outcome), (plain_rows, plain) = arguments[-2:], interpreted[-2:]
+        outcome, plain = kernels.Outcome(*outcome), kernels.Outcome(*plain)
         for mine, expected in ((rows, plain_rows), (outcome.observed, plain.observed)):
             np.testing.assert_allclose(mine.view(np.float64), expected.view(np.float64), rtol=1e-13, atol=1e-13)
         np.testing.assert_allclose(outcome.reward, plain.reward, rtol=1e-13)
         np.testing.assert_array_equal(outcome.ends, plain.ends)
-        np.testing.assert_array_equal(noise.used, interpreted[2].used)
+        np.testing.assert_array_equal(kernels.Noise(*noise).used, kernels.Noise(*interpreted[2]).used)
         steps += 1
         return is_over
 

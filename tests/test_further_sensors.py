@@ -1,5 +1,6 @@
 """Sensors beyond the standard set, on one joint, on three and on the walker: the truth and its errors."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -10,10 +11,12 @@ import baselines
 from baselines.residual.mirror import Mirror
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.runtime import further_sensors
 from elastic_env.runtime.further_sensors import SENSORS
 from tests.three_joints import ARM
 
 ARM.register()
+ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.3, "onset_s": 0.4, "amplitude": 0.1}
 MOTIONS: dict[str, dict[str, Any]] = {
     "elastic_env/Testbed-v0": {"reference": QUICK},
@@ -153,3 +156,17 @@ def test_policies_play_with_all_of_them(robot: str) -> None:
         observation, _ = one.reset(seed=4)
         actions.append(policy.predict(observation)[0])
     np.testing.assert_array_equal(*actions)
+
+
+@pytest.mark.parametrize("text", [str(further_sensors.__doc__), (ROOT / "docs" / "robots.md").read_text("utf-8")])
+def test_tables_have_every_sensor_with_its_unit_columns_and_noise(text: str) -> None:
+    """Catches a sensor that is declared and not documented, and a number in a table that is not the declared one."""
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    table = {row[0].strip("`"): row[1:] for row in rows if row[0].strip("`") in SENSORS}
+    assert table.keys() == SENSORS.keys()
+    for name, sensor in SENSORS.items():
+        columns, unit, _, error = table[name]
+        assert columns == (", ".join(sensor.axes) if sensor.axes else "a joint each")
+        assert unit == sensor.unit
+        assert f"{sensor.noise:.3g}" in error or sensor.is_encoder
+        assert f"{sensor.offset:.3g}" in error or not sensor.offset

@@ -48,8 +48,8 @@ def test_nothing_of_the_working_directory_runs_in_a_child(
         with AttitudeStream(emulator.imu_port, oldest_s=0.5) as stream:
             stream.latest()
         done = subprocess.run(
-            child_command("train.hardware.wave", "/dev/ttyNOTHING", "1"), env=child_environment(), capture_output=True,
-            text=True, timeout=60, check=False,
+            child_command("tests.hardware_trials.wave", "/dev/ttyNOTHING", "1"), env=child_environment(),
+            capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert "/dev/ttyNOTHING: there is no such device" in done.stdout
     assert not said.exists(), said.read_text()

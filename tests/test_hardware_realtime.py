@@ -75,7 +75,7 @@ def test_a_program_that_keeps_the_processor_busy_does_not_keep_torque_on() -> No
         busy.kill()
         busy.communicate()
     # not when the servo loses its torque: the kernel carries bytes between pseudo-terminals in its turn with all other
-    # programs, so that the 100 ms asked for are held to by `elastic hardware prove`
+    # programs, so that the 100 ms asked for are held to by `python -m tests.hardware_trials`
     assert in_line < BUSY_S / 2
 
 

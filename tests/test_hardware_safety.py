@@ -360,7 +360,7 @@ def test_ids_that_cannot_be_are_refused_before_anything_starts() -> None:
 @pytest.mark.parametrize("how", ["kill", "stop", "interrupt", "kill-supervisor"])
 def test_torque_goes_off_whatever_ends_the_program(emulator: RunningEmulator, how: str) -> None:
     """Catches every way of leaving a servo under torque: death, hang, Ctrl-C, and the death of the supervisor."""
-    command = [sys.executable, "-m", "train.hardware.wave", emulator.port, "1"]
+    command = [sys.executable, "-m", "tests.hardware_trials.wave", emulator.port, "1"]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
         assert program.stdout is not None

@@ -33,9 +33,10 @@ from elastic_env.hardware.testbed import plant
 from elastic_env.hardware.testbed.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from tests.busy import once_more
+from tests.hardware_trials import trials as hardware_trials
+from tests.hardware_trials.__main__ import prove
 from train.commands.cli import main
 from train.experiments.identify import IdentifyConfig, identified_environments
-from train.hardware import trials as hardware_trials
 from train.hardware.session import hardware_arguments
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
@@ -302,6 +303,12 @@ def test_a_measurement_of_which_every_try_is_spoiled_is_not_met(monkeypatch: pyt
     assert "all 2 tries had stopped" in trial.measured
 
 
+def test_a_measurement_that_does_not_exist_is_refused() -> None:
+    """Catches half an hour of measurements that were not asked for."""
+    with pytest.raises(ConfigurationError, match="killed"):
+        prove(only=("kiled",))
+
+
 def test_mounting_turns_angles_into_the_joints() -> None:
     """Catches a sign that is applied to the angle but not to the limits."""
     mounting = HardwareSettings(port="p", direction=-1, zero_rad=0.5, limits={"lowest_rad": -1.0, "highest_rad": 0.3})  # type: ignore[arg-type]
@@ -442,7 +449,6 @@ def test_commands_say_what_hardware_needs(capsys: pytest.CaptureFixture[str]) ->
         (["evaluate", "--patient"], "--patient is for a real testbed"),
         (["evaluate", "--env", "walker", "--port", "/dev/null"], "testbed"),
         (["hardware", "run"], "--port"),
-        (["hardware", "prove", "--only", "kiled"], "killed"),
     ):
         with pytest.raises(SystemExit):
             main(arguments)

@@ -6,13 +6,14 @@ lists the keys that exist.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import no_info_before_validator_function
 
 from elastic_env.core.config_problems import ModelError, problems_of
 from elastic_env.core.errors import ConfigurationError, shown
@@ -31,57 +32,6 @@ def quantity(unit: str, default: Any = ..., *, description: str, **bounds: Any) 
         **bounds: Any of gt, ge, lt, le.
     """
     return Field(default, description=f"{description} [{unit}]", json_schema_extra={"unit": unit}, **bounds)
-
-
-class Model(BaseModel):
-    """Base of all parameter models: frozen, no unknown keys, no NaN, errors with unit and bound.
-
-    Numbers are numbers: Python's or NumPy's, and arrays of them, but neither text nor truth values.
-    """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, use_attribute_docstrings=True
-    )
-
-    def __init__(self, /, **values: Any) -> None:
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _numbers_are_numbers(cls, values: Any) -> Any:
-        if not isinstance(values, dict):
-            return values
-        fields = cls.model_fields
-        return {
-            name: _only_numbers(plain_numbers(value))
-            if name in fields and _is_numeric(fields[name].annotation)
-            else value
-            for name, value in values.items()
-        }
-
-    def replace(self, **changes: Any) -> Self:
-        """A validated copy with some parameters changed."""
-        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
-
-
-def _is_text(value: str) -> str:
-    if NO_TEXT.search(value):
-        raise ValueError(f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}")
-    return value
-
-
-_Text = Annotated[str, AfterValidator(_is_text)]
-Title = Annotated[_Text, Field(max_length=100)]
-"""Text that names something in tables and files."""
-Locator = Annotated[_Text, Field(max_length=1000)]
-"""Text that may hold a path."""
-MOST_ENTRIES = 1000
-"""Entries of a list in a configuration."""
-LARGEST_SEED = 2**63 - 1
-"""Seeds of episodes are 64-bit integers."""
 
 
 def plain_numbers(value: Any) -> Any:
@@ -106,35 +56,69 @@ def plain_numbers(value: Any) -> Any:
             return value
 
 
-@dataclass(frozen=True)
-class _NoNumber:
-    """Text or a truth value in a number's place, which Pydantic would convert; shown as it was given."""
-
-    given: Any
-
-    def __repr__(self) -> str:
-        return repr(self.given)
-
-
-def _only_numbers(value: Any) -> Any:
-    """The same with text and truth values, also within lists, tuples and mappings, made what no number field takes."""
-    if isinstance(value, list | tuple):
-        return [_only_numbers(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _only_numbers(item) for key, item in value.items()}
-    return _NoNumber(value) if isinstance(value, str | bytes | bool) else value
+def _with_strict_numbers(schema: Any) -> Any:
+    """A schema of Pydantic's whose numbers are strict wherever they stand, and may be NumPy's; lists may be arrays."""
+    if isinstance(schema, list | tuple):
+        return type(schema)(_with_strict_numbers(part) for part in schema)
+    if not isinstance(schema, dict) or schema.get("strict"):
+        return schema
+    of_values = "default", "expected", "metadata"
+    own: Any = {key: part if key in of_values else _with_strict_numbers(part) for key, part in schema.items()}
+    convert = {"float": plain_numbers, "int": _whole, "list": plain_numbers, "tuple": plain_numbers}.get(
+        own.get("type")
+    )
+    if own.get("type") in ("float", "int"):
+        own["strict"] = True
+    return own if convert is None else no_info_before_validator_function(convert, own)
 
 
-def _is_numeric(annotation: Any) -> bool:
-    """Whether an annotation is of numbers, or of lists, tuples and mappings of them, and allows nothing else."""
-    if annotation in (int, float):
-        return True
-    arguments = [part for part in get_args(annotation) if part not in (type(None), Ellipsis)]
-    if get_origin(annotation) is Annotated:
-        arguments = arguments[:1]
-    if get_origin(annotation) is dict:
-        arguments = arguments[1:]
-    return bool(arguments) and all(map(_is_numeric, arguments))
+def _whole(value: Any) -> Any:
+    """A whole number that is written as 1e3, as one."""
+    number = plain_numbers(value)
+    return int(number) if isinstance(number, float) and number.is_integer() else number
+
+
+class Model(BaseModel):
+    """Base of all parameter models: frozen, no unknown keys, no NaN, errors with unit and bound.
+
+    Numbers are numbers: Python's or NumPy's, and arrays of them, but neither text nor truth values.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, use_attribute_docstrings=True
+    )
+
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ModelError(type(self).__name__, problems_of(type(self), error, values)) from None
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Pydantic's schema with strict numbers."""
+        return _with_strict_numbers(handler(source))
+
+    def replace(self, **changes: Any) -> Self:
+        """A validated copy with some parameters changed."""
+        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+
+
+def _is_text(value: str) -> str:
+    if NO_TEXT.search(value):
+        raise ValueError(f"a name must hold neither zero bytes nor halves of characters, got {shown(value)}")
+    return value
+
+
+_Text = Annotated[str, AfterValidator(_is_text)]
+Title = Annotated[_Text, Field(max_length=100)]
+"""Text that names something in tables and files."""
+Locator = Annotated[_Text, Field(max_length=1000)]
+"""Text that may hold a path."""
+MOST_ENTRIES = 1000
+"""Entries of a list in a configuration."""
+LARGEST_SEED = 2**63 - 1
+"""Seeds of episodes are 64-bit integers."""
 
 
 def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] | None = None) -> ModelT:

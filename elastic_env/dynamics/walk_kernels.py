@@ -4,7 +4,8 @@ One pass over the worlds, from MuJoCo's state to the observation. A world's numb
 have their fields by name, see `elastic_env.robots.thormang.rows`.
 
 Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
-file, and every size comes from a type.
+file, and every size comes from a type. A kernel that Python calls takes plain tuples and names their parts itself:
+Numba takes a microsecond more for a tuple with names.
 """
 
 import math
@@ -60,8 +61,9 @@ class Outcome(NamedTuple):
 
 
 @compiled
-def command(rows: Any, offset: Array, walker: Walker, inputs: Array) -> None:
+def command(rows: Any, offset: Array, walker: Any, inputs: Array) -> None:
     """Servo inputs of the coming control period, q_ref + offset, by encoders that are off by a bias, (n, 12) [rad]."""
+    walker = Walker(*walker)
     for world in range(len(offset)):
         coming, bias = row_of(walker.plan, rows[world].truth.step + 1), walker.bias[world]
         for i in range(offset.shape[1]):
@@ -69,8 +71,9 @@ def command(rows: Any, offset: Array, walker: Walker, inputs: Array) -> None:
 
 
 @compiled
-def begin(physics: Physics, walker: Walker, noise: Noise, worlds: BoolArray, rows: Any) -> None:
+def begin(physics: Any, walker: Any, noise: Any, worlds: BoolArray, rows: Any) -> None:
     """Truth and measurements at the start of an episode in some worlds, whose encoders have been at rest."""
+    physics, walker, noise = Physics(*physics), Walker(*walker), Noise(*noise)
     constants, feet = walker.constants[0], feet_to_be_filled()
     for world in range(len(rows)):
         if worlds[world]:
@@ -80,30 +83,31 @@ def begin(physics: Physics, walker: Walker, noise: Noise, worlds: BoolArray, row
             drawn, bias = sample_of(noise, world), walker.bias[world]
             if constants.quality.inertial.is_fitted:
                 settle_imu(truth, drawn, bias, constants.quality, shown)
-            measure(truth, drawn, bias, constants.quality, True, shown)
+            imu_is_due = row_of(walker.plan, truth.step).imu_is_due  # as always at first
+            measure(truth, drawn, bias, constants.quality, imu_is_due, shown)
             shown.encoder_before[:] = shown.encoder
 
 
 @compiled
 def control_step(
-    physics: Physics, walker: Walker, noise: Noise, commanded: tuple[Array, BoolArray], last: Any, now: Any,
-    outcome: Outcome,
-) -> bool:  # fmt: skip
+    physics: Any, walker: Any, noise: Any, commanded: tuple[Array, BoolArray], last: Any, now: Any, outcome: Any
+) -> bool:
     """Everything after the physics.
 
     Args:
-        physics: State of all worlds.
-        walker: What does not change.
-        noise: Of the sensors.
+        physics: State of all worlds, `Physics`.
+        walker: What does not change, `Walker`.
+        noise: Of the sensors, `Noise`.
         commanded: Offsets of this control period, (n, 12) [rad], and the worlds that diverged under them, (n,). These
             keep truth and measurements.
         last: Rows of the step before, (n,).
         now: To be filled, (n,).
-        outcome: To be filled.
+        outcome: To be filled, `Outcome`.
 
     Returns:
         Whether an episode ends.
     """
+    physics, walker, noise, outcome = Physics(*physics), Walker(*walker), Noise(*noise), Outcome(*outcome)
     offset, diverged = commanded
     is_over, constants, feet = False, walker.constants[0], feet_to_be_filled()
     rules = constants.rules
@@ -131,8 +135,9 @@ def control_step(
 
 
 @compiled
-def show(rows: Any, shown: Any, walker: Walker, observed: Any) -> None:
+def show(rows: Any, shown: Any, walker: Any, observed: Any) -> None:
     """Observations of the present state; `shown` are the rows whose measurements are shown."""
+    walker = Walker(*walker)
     period_s = walker.constants[0].rules.control_period_s
     for world in range(len(rows)):
         coming = row_of(walker.plan, rows[world].truth.step + 1)

@@ -119,10 +119,10 @@ CHANGES: dict[str, ScenarioChange] = {
 """Parameters that a change sets on its ground."""
 
 
-WALKER_ONLY = ("spread", "imu", "push", "slope")
-"""Changes that only a robot that walks knows."""
 WALKER_FIELDS = ("stiffness_spread", "inertial", "push_n", "slope_rad")
-"""What they set."""
+"""Parameters that only a robot that walks knows."""
+WALKER_ONLY = tuple(name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS})
+"""Changes that set one of them."""
 
 
 def scenario_names(walks: bool = True) -> list[str]:

@@ -1,6 +1,7 @@
 """The info of a step, most of which nobody may ever look at."""
 
-from collections.abc import Callable, ItemsView, Iterator, KeysView, ValuesView
+import functools
+from collections.abc import Callable
 from typing import Any
 
 
@@ -37,57 +38,10 @@ class StepInfo(dict[str, Any]):
         self._settle()
         return self[key]
 
-    def get(self, key: str, default: Any = None) -> Any:
-        """As `dict.get`."""
-        self._settle()
-        return super().get(key, default)
-
     def __contains__(self, key: object) -> bool:
         if not super().__contains__(key):
             self._settle()
         return super().__contains__(key)
-
-    def __iter__(self) -> Iterator[str]:
-        self._settle()
-        return super().__iter__()
-
-    def __len__(self) -> int:
-        self._settle()
-        return super().__len__()
-
-    def keys(self) -> KeysView[str]:  # type: ignore[override]
-        """As `dict.keys`."""
-        self._settle()
-        return super().keys()
-
-    def values(self) -> ValuesView[Any]:  # type: ignore[override]
-        """As `dict.values`."""
-        self._settle()
-        return super().values()
-
-    def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
-        """As `dict.items`."""
-        self._settle()
-        return super().items()
-
-    def pop(self, *args: Any) -> Any:
-        """As `dict.pop`."""
-        self._settle()
-        return super().pop(*args)
-
-    def popitem(self) -> tuple[str, Any]:
-        """As `dict.popitem`."""
-        self._settle()
-        return super().popitem()
-
-    def setdefault(self, key: str, default: Any = None) -> Any:
-        """As `dict.setdefault`."""
-        self._settle()
-        return super().setdefault(key, default)
-
-    def __delitem__(self, key: str) -> None:
-        self._settle()
-        super().__delitem__(key)
 
     def clear(self) -> None:
         """As `dict.clear`."""
@@ -112,8 +66,23 @@ class StepInfo(dict[str, Any]):
 
     __hash__ = None  # type: ignore[assignment]
 
-    def __repr__(self) -> str:
-        return repr(self.complete())
-
     def __reduce_ex__(self, protocol: Any) -> Any:
         return dict, (self.complete(),)
+
+
+def _when_complete(name: str) -> Callable[..., Any]:
+    """A method of dictionaries, after the rest has been computed."""
+    method: Callable[..., Any] = getattr(dict, name)
+
+    @functools.wraps(method)
+    def of_all(self: StepInfo, *arguments: Any) -> Any:
+        self._settle()
+        return method(self, *arguments)
+
+    return of_all
+
+
+for _name in (
+    "get", "keys", "values", "items", "pop", "popitem", "setdefault", "__iter__", "__len__", "__delitem__", "__repr__"
+):  # fmt: skip
+    setattr(StepInfo, _name, _when_complete(_name))

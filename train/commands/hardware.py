@@ -1,4 +1,4 @@
-"""`elastic hardware`: scan, check, run, emulate, prove."""
+"""`elastic hardware`: scan, check, run, emulate."""
 
 import sys
 from dataclasses import dataclass, field
@@ -141,37 +141,14 @@ class Emulate:
 
 
 @dataclass
-class Prove:
-    """Measure what driver, limits and supervisor do when things go wrong, against an emulated bus.
-
-    Long: about half an hour; --share 0.02 makes a short one. Exit code 3 if something is not as it must be.
-    """
-
-    share: float = 1.0
-    """Share of the repetitions and durations."""
-    only: list[str] = field(default_factory=list)
-    """Names of the measurements; default all."""
-    output: Path | None = None
-    """Folder for hardware.json, new or empty; default runs/prove, numbered if taken."""
-
-    def run(self) -> None:
-        """Measure."""
-        from train.hardware.prove import prove
-
-        if not prove(self.share, self.only, CONSOLE, self.output):
-            sys.exit(3)
-
-
-@dataclass
 class Hardware:
-    """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate, prove."""
+    """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate."""
 
     command: (
         Annotated[Scan, tyro.conf.subcommand("scan")]
         | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Run, tyro.conf.subcommand("run")]
         | Annotated[Emulate, tyro.conf.subcommand("emulate")]
-        | Annotated[Prove, tyro.conf.subcommand("prove")]
     )
 
     def run(self) -> None:

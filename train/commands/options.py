@@ -50,11 +50,14 @@ def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:
     """Where a comparison plays: the named environment, or with arguments of hardware a real testbed."""
     if not arguments:
         return {"env": env}
-    if env not in ("testbed", "hardware"):
+    from train.evaluate.environments import environment
+
+    real = environment(env).on_hardware
+    if not real:
         raise ConfigurationError(
             f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or --port and --mounting"
         )
-    return {"env": "hardware", "env_options": arguments}
+    return {"env": real, "env_options": arguments}
 
 
 def scenario_played(asked: str | None, arguments: dict[str, Any]) -> str:

@@ -182,13 +182,14 @@ class Play:
     def run(self) -> None:
         """Play."""
         from train.evaluate.conditions import Condition, PolicySpec
+        from train.evaluate.environments import environment
         from train.experiments.play import play
 
-        reference = "sine" if self.reference is None and self.env == "testbed" else self.reference
+        watched = environment(self.env).watched_reference if self.reference is None else None
         with options_named():
             condition = Condition(
-                env=self.env, policy=PolicySpec(name=self.policy), reference=motion(self.env, reference),
-                scenario=self.scenario, seed=self.seed,
+                env=self.env, policy=PolicySpec(name=self.policy), scenario=self.scenario, seed=self.seed,
+                reference=motion(self.env, self.reference) if watched is None else watched,
             )  # fmt: skip
         play(condition, CONSOLE, self.video, self.max_s)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, TypeAlias
 
+from elastic_env import IDS
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
@@ -93,6 +94,9 @@ class Environment:
         id: Its name for `gymnasium.make`.
         motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
         default_reference: Reference where none is named.
+        watched_reference: The same for a picture; None for the default.
+        looped_policy: Policy in the loop of which the speed is measured, the best that needs no truth.
+        on_hardware: Short name of the same robot on hardware; empty where there is none.
         arguments: Arguments of `gymnasium.make` for a reference.
         label: How tables and figures call a reference.
         draws: Whether episodes of a reference have motions of their own.
@@ -138,6 +142,9 @@ class Environment:
     failure: str = "fail"
     is_real: bool = False
     walks: bool = False
+    watched_reference: Reference | None = None
+    looped_policy: str = "zero"
+    on_hardware: str = ""
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
         """Whether all episodes of a condition are one and the same."""
@@ -227,7 +234,7 @@ def _walk_abscissa(reference: Reference) -> dict[str, float]:
 
 
 _TESTBED = Environment(
-    id="elastic_env/Testbed-v0",
+    id=IDS["testbed"],
     motion="reference",
     default_reference="hold",
     arguments=lambda reference: {"reference": reference},
@@ -254,6 +261,9 @@ _TESTBED = Environment(
         TracedSignal("link angle", "link_angle", "rad", 1.0, reference="reference_angle"),
         TracedSignal("link error", "link_error", "mrad", 1e3),
     ),
+    watched_reference="sine",
+    looped_policy="input",
+    on_hardware="hardware",
 )  # fmt: skip
 
 _JOINTS = replace(
@@ -266,13 +276,15 @@ _JOINTS = replace(
         TracedSignal("link error", "link_error", "mrad", 1e3),
         TracedSignal("deflection", "deflection", "mrad", 1e3),
     ),
+    watched_reference=None,
+    on_hardware="",
 )
 """Several joints on a fixed base: the figures are those of all joints together."""
 
 _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
 
 _WALKER = Environment(
-    id="elastic_env/WalkInPlace-v0",
+    id=IDS["walker"],
     motion="step_period",
     default_reference=3,
     arguments=_walk_arguments,
@@ -323,11 +335,12 @@ _WALKER = Environment(
     quantity="step period",
     failure="falls",
     walks=True,
+    looped_policy="input_wrench",
 )  # fmt: skip
 
 _HARDWARE = replace(
     _TESTBED,
-    id="elastic_env/HardwareTestbed-v0",
+    id=IDS["hardware"],
     columns=tuple(column for column in _TESTBED.columns if column.title not in ("est.", "peak")),  # IMU- or IMU+ is it
     traced=(*_TESTBED.traced, "jitter", "overruns", "missed_replies"),
     subject="link error by the IMU",
@@ -335,5 +348,6 @@ _HARDWARE = replace(
     is_real=True,
 )
 
-ENVIRONMENTS = {"testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE}
-"""Environments by the short names of the command line."""
+_OWN = {"testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE}
+ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known) for name, known in IDS.items()}
+"""Environments by their short names: those with figures of their own, and other robots of elastic joints."""

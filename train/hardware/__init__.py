@@ -1,1 +1,1 @@
-"""Sessions with servos, and trials of the safety path on emulated ones."""
+"""Sessions with servos, real or emulated."""

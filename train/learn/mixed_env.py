@@ -70,7 +70,6 @@ class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
         ends = np.cumsum(sizes).tolist()
         self._worlds = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
         self._weights = np.repeat(factors, sizes)
-        self._weights.flags.writeable = False  # no state
         self.num_envs = ends[-1]
         self.autoreset_mode = AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": self.autoreset_mode}

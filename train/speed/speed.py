@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from elastic_env.core.config import Model, quantity
+from train.evaluate.environments import environment
 from train.runs.folders import run_folder
 from train.runs.workers import plain_progress
 from train.speed.contenders import (
@@ -135,7 +136,7 @@ def _entries(config: SpeedConfig) -> list[_Entry]:
 
 def _policy(config: SpeedConfig) -> str:
     """The policy in the loop: the one that is asked for, or the environment's best that needs no truth."""
-    return config.policy or {"walker": "input_wrench", "testbed": "input"}.get(config.env, "zero")
+    return config.policy or environment(config.env).looped_policy
 
 
 def _result(config: SpeedConfig, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:

@@ -1,1 +1,3 @@
 """The testbed on hardware, as an environment."""
+
+NAME, ID = "hardware", "elastic_env/HardwareTestbed-v0"

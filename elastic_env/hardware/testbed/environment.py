@@ -8,13 +8,13 @@ from gymnasium.vector import AutoresetMode
 
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.testbed import ID
 from elastic_env.hardware.testbed.settings import HardwareSettings
 from elastic_env.hardware.testbed.task import HardwareTestbedTask
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 
-_ID = "elastic_env/HardwareTestbed-v0"
 SCENARIO = "hardware"
 """What stands for the scenario in tables of results."""
 _OF_A_SIMULATION = ("form", "timestep_s")
@@ -32,12 +32,12 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if port is None:
-        raise ConfigurationError(f"{_ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT")
+        raise ConfigurationError(f"{ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT")
     of_settings = [name for name in HardwareSettings.model_fields if name != "port"]
     of_testbed = [name for name in inspect.signature(configure_testbed).parameters if name not in _OF_A_SIMULATION]
     for name in arguments:
         if name not in (*of_settings, *of_testbed):
-            raise unknown_name(f"argument of {_ID}", name, ["port", *of_settings, *of_testbed])
+            raise unknown_name(f"argument of {ID}", name, ["port", *of_settings, *of_testbed])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
         raise HardwareError(f"a scenario is of a simulation; on hardware it is what it is, got {scenario!r}")

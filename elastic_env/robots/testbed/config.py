@@ -8,6 +8,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
+from elastic_env.robots.testbed import NAME
 from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.joint_config import JointConfig, require_torque
@@ -48,7 +49,7 @@ def plant(config: TestbedConfig) -> JointPlant:
     if ACCELEROMETER in config.sensors:
         add_accelerometer(spec, "imu")
     return JointPlant(
-        name="testbed", model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
+        name=NAME, model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
         true=robot_model(joint, pendulum), static_torque=pendulum.torque,
         rest_angle=partial(_rest_angle, joint=joint, pendulum=pendulum), home=np.zeros(1),
     )  # fmt: skip

@@ -8,6 +8,7 @@ from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import AnyReference, make_reference
 from elastic_env.registration import Robot, require_models
+from elastic_env.robots.testbed import ID, NAME
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
@@ -69,5 +70,5 @@ def picture(task: TestbedTask) -> TestbedPicture:
     return TestbedPicture(task.config.pendulum)
 
 
-TESTBED = Robot("testbed", "elastic_env/Testbed-v0", configure_testbed, TestbedTask, picture)
+TESTBED = Robot(NAME, ID, configure_testbed, TestbedTask, picture)
 make, make_vector = TESTBED.make, TESTBED.make_vector

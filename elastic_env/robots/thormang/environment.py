@@ -8,6 +8,7 @@ from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
 from elastic_env.registration import Robot, require_models
+from elastic_env.robots.thormang import ID, NAME
 from elastic_env.robots.thormang.config import WalkConfig, WalkRewardWeights
 from elastic_env.robots.thormang.model import Thormang
 from elastic_env.robots.thormang.picture import WalkerPicture
@@ -80,5 +81,5 @@ def configure_walk(
     )
 
 
-WALKER = Robot("walker", "elastic_env/WalkInPlace-v0", configure_walk, WalkTask, WalkerPicture)
+WALKER = Robot(NAME, ID, configure_walk, WalkTask, WalkerPicture)
 make, make_vector = WALKER.make, WALKER.make_vector

@@ -55,6 +55,7 @@ plan's world frame, x forward, y to the left:
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -68,6 +69,7 @@ from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
+from elastic_env.robots.thormang import NAME
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
@@ -120,7 +122,7 @@ class WalkTask(Stateful):
         "_has_fallen",
     )  # fmt: skip
 
-    name = "walker"
+    name = NAME
     action_table = ACTION
     assumed_model: RobotModel
     metrics: Sequence[Metric] = METRICS
@@ -171,7 +173,6 @@ class WalkTask(Stateful):
             rules=_rules(config, UNLOADED_SHARE * weight, least_n),
         )  # fmt: skip
         self._plan_rows = _plan_rows(self.plan, config)
-        self._known = kernels.Walker(self._constants, self._plan_rows, self._bias)
         self._draw = np.zeros(n, dtype=np.int64)
         self._damping = self._true_model.damping
         self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
@@ -207,7 +208,7 @@ class WalkTask(Stateful):
         if not self._is_compiled:
             compile_now(self._rehearse, simulation)
             self._is_compiled = True
-        kernels.begin(self._physics(simulation), self._walker, self._ready(), worlds, rows)
+        kernels.begin(self._physics(simulation), self._walker, self._noise.ready(), worlds, rows)
         self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
         self._shown = np.where(worlds, rows, self._shown)
         if self._sensors:
@@ -216,12 +217,13 @@ class WalkTask(Stateful):
     def _rehearse(self, simulation: Simulation) -> None:
         """Call all kernels on rows of their own."""
         n, rows, samples = self.num_worlds, np.zeros((2, self.num_worlds), STEP), np.zeros((1, self.num_worlds), NOISE)
-        noise, physics = kernels.Noise(samples, np.zeros(n, dtype=np.int64)), self._physics(simulation)
-        commanded, outcome = (self._offset, np.zeros(n, dtype=np.bool_)), _outcome(n)
+        noise, physics = (samples, np.zeros(n, dtype=np.int64)), self._physics(simulation)
+        commanded = self._offset, np.zeros(n, dtype=np.bool_)
+        outcome = _observed(n)[1], np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_)
         kernels.begin(physics, self._walker, noise, ~commanded[1], rows[0])
         kernels.command(rows[0], self._offset, self._walker, np.zeros_like(simulation.ctrl))
         kernels.control_step(physics, self._walker, noise, commanded, rows[0], rows[1], outcome)
-        kernels.show(rows[0], rows[1], self._walker, outcome.observed)
+        kernels.show(rows[0], rows[1], self._walker, outcome[0])
         self.signals(WalkSample(rows[0]))
 
     def command(self, offset: Array, inputs: Array) -> None:
@@ -240,15 +242,17 @@ class WalkTask(Stateful):
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
         """Read the new state, then what the sensors show of it; score it."""
         n, last, rows = self.num_worlds, self._rows, self._next_rows()
-        outcome, commanded = _outcome(n), (self._offset, diverged)
+        columns, observed = _observed(n)
+        reward, ends = np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_)
         is_over = kernels.control_step(
-            self._physics(simulation), self._walker, self._ready(), commanded, last, rows, outcome
-        )
+            self._physics(simulation), self._walker, self._noise.ready(), (self._offset, diverged), last, rows,
+            (observed, reward, ends),
+        )  # fmt: skip
         self._rows, self._shown = rows, last if self.config.scenario.delay_steps > 0 else rows
-        self._has_fallen = outcome.ends[FELL_ROW]
+        self._has_fallen = ends[FELL_ROW]
         if self._sensors:
             self._sensors.measure(~diverged, self._felt(simulation))
-        return Outcome(self._observation(outcome.observed), WalkSample(rows), outcome.reward, outcome.ends, is_over)
+        return Outcome(self._observation(columns), WalkSample(rows), reward, ends, is_over)
 
     def _next_rows(self) -> Records:
         """Rows for a control step, of which samples may keep them: several are made at once, which costs less."""
@@ -260,13 +264,12 @@ class WalkTask(Stateful):
 
     def observe(self) -> Array:
         """See the table of the module."""
-        observed = np.empty(self.num_worlds, OBSERVED)
+        columns, observed = _observed(self.num_worlds)
         kernels.show(self._rows, self._shown, self._walker, observed)
-        return self._observation(observed)
+        return self._observation(columns)
 
-    def _observation(self, observed: Records) -> Array:
-        """Rows of `OBSERVED` and what further sensors show, as the columns of an observation."""
-        columns = observed.view(np.float64).reshape(len(observed), -1)
+    def _observation(self, columns: Array) -> Array:
+        """The standard columns of an observation and what further sensors show."""
         return np.hstack([columns, self._sensors.columns()]) if self._sensors else columns
 
     def _felt(self, simulation: Simulation) -> Felt:
@@ -349,19 +352,14 @@ class WalkTask(Stateful):
         """Rows of the plan's tables."""
         return np.minimum(sample.rows["truth"]["step"], self.num_steps)
 
-    def _physics(self, simulation: Simulation) -> kernels.Physics:
-        return kernels.Physics(*simulation.views(kernels.Physics._fields))
+    def _physics(self, simulation: Simulation) -> tuple[Any, ...]:
+        """`kernels.Physics`."""
+        return simulation.views(kernels.Physics._fields)
 
     @property
-    def _walker(self) -> kernels.Walker:
-        """What the kernels know of the robot, made anew where its biases have been, as when a state is restored."""
-        if self._known.bias is not self._bias:
-            self._known = kernels.Walker(self._constants, self._plan_rows, self._bias)
-        return self._known
-
-    def _ready(self) -> kernels.Noise:
-        """Noise of the sensors ahead."""
-        return kernels.Noise(*self._noise.ready())
+    def _walker(self) -> tuple[Any, ...]:
+        """`kernels.Walker`."""
+        return self._constants, self._plan_rows, self._bias
 
     def _draw_push(self, world: int, draws: Draws) -> None:
         """Time and direction of the push, in the walk."""
@@ -432,9 +430,10 @@ def _halves_of_swing(plan: WalkPlan) -> IntArray:
     return np.where(timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0)
 
 
-def _outcome(n: int) -> kernels.Outcome:
-    """To be filled."""
-    return kernels.Outcome(np.empty(n, OBSERVED), np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_))
+def _observed(n: int) -> tuple[Array, Records]:
+    """Columns of an observation to be filled, (n, columns), and the same memory as rows of `OBSERVED`, (n,)."""
+    columns = np.empty((n, len(OBSERVATION)))
+    return columns, np.ndarray(n, OBSERVED, columns)
 
 
 def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
@@ -482,7 +481,7 @@ def highest(values: Array) -> Array:
 
 def rms(values: Array) -> Array:
     """Root of the mean square over the last axis of (n, m)."""
-    return kernels.rms_of_rows(values)
+    return kernels.rms_of_rows(np.array(values, order="C"))  # of one kind, for which it is compiled
 
 
 def rotation_of(quaternion: Array) -> Array:

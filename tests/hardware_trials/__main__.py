@@ -1,27 +1,31 @@
-"""The table of `elastic hardware prove`."""
+"""The table of all measurements: `python -m tests.hardware_trials`, about half an hour; `--help` has the options.
+
+Exit code 3 if something is not as it must be.
+"""
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
+import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.hardware.errors import HardwareError
-from train.hardware.trials import TRIALS, Trial
+from tests.hardware_trials.trials import TRIALS, Trial
 from train.runs.folders import run_folder
 
 
-def prove(share: float, only: list[str], console: Console, output: Path | None = None) -> bool:
+def prove(share: float = 1.0, only: tuple[str, ...] = (), output: Path | None = None) -> bool:
     """Measure, print the table, write hardware.json; whether everything is as it must be.
 
     Args:
-        share: Share of repetitions and durations, (0, 1].
-        only: Names of the measurements, all if empty.
-        console: Where the table goes.
-        output: Folder for the results; default runs/prove, numbered if taken.
+        share: Share of repetitions and durations, above 0 and at most 1; 0.02 makes a short one.
+        only: Names of the measurements; default all.
+        output: Folder for hardware.json; default runs/prove, numbered if taken.
 
     Raises:
         ConfigurationError: A name does not exist, or the share is none.
@@ -31,7 +35,7 @@ def prove(share: float, only: list[str], console: Console, output: Path | None =
     for name in only:
         if name not in TRIALS:
             raise unknown_name("measurement", name, TRIALS)
-    trials: list[Trial] = []
+    trials, console = list[Trial](), Console()
     with run_folder("prove", {"share": share, "only": only}, None, output) as folder:
         for name in only or TRIALS:
             trials.append(_measured(name, share))
@@ -51,3 +55,7 @@ def _measured(name: str, share: float) -> Trial:
         return TRIALS[name](share)
     except HardwareError as error:
         return Trial(name, name, f"ended by a fault: {error}", False, {})
+
+
+if __name__ == "__main__":
+    sys.exit(0 if tyro.cli(prove) else 3)

@@ -1,4 +1,4 @@
-"""What `elastic hardware prove` measures, each against an emulated bus through the real SDKs."""
+"""Measurements against an emulated bus through the real SDKs."""
 
 import contextlib
 import math
@@ -29,8 +29,8 @@ from elastic_env.hardware.safety.supervised import SupervisedBus
 from elastic_env.hardware.servo_bus.bus import Bus, States
 from elastic_env.hardware.servo_bus.control_table import servo_model
 from elastic_env.robots.testbed.config import TestbedConfig
+from tests.hardware_trials.wave import PERIOD_S, goal
 from train.hardware.session import PATIENT_LIMITS
-from train.hardware.wave import PERIOD_S, goal
 
 _USB_LATENCY = Faults(latency_s=1e-3)
 _TORQUE_OFF_S = 0.1
@@ -402,8 +402,8 @@ def _end_once(
     """Time from the end of the program to torque off [s]; None if the motion had ended before."""
     emulator.wait_until_rest()
     program = subprocess.Popen(
-        child_command("train.hardware.wave", emulator.port, "1"), env=child_environment(), stdout=subprocess.PIPE,
-        text=True, start_new_session=True,
+        child_command("tests.hardware_trials.wave", emulator.port, "1"), env=child_environment(),
+        stdout=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     try:
         assert program.stdout is not None
@@ -476,7 +476,7 @@ def _unplug(emulator: RunningEmulator, bus: SupervisedBus, generator: np.random.
     return False
 
 
-def header_positions(share: float) -> Trial:  # noqa: ARG001  there are few
+def header_positions(share: float) -> Trial:
     """Positions whose bytes look like a header, and their neighbours, written alone and to all, and read back."""
     wrong = tried = 0
     for number in (54024, 54025, 2020):
@@ -496,7 +496,7 @@ def header_positions(share: float) -> Trial:  # noqa: ARG001  there are few
     )  # fmt: skip
 
 
-def second_program(share: float) -> Trial:  # noqa: ARG001  once is enough
+def second_program(share: float) -> Trial:
     """Another program on a port that is taken."""
     with RunningEmulator() as emulator, SupervisedBus({emulator.port: [1]}):
         try:

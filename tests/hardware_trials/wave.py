@@ -1,6 +1,6 @@
-"""A program that moves servos up and down, to be killed: started by `train.hardware.trials`.
+"""A program that moves servos up and down, to be killed: started by `tests.hardware_trials.trials`.
 
-python -m train.hardware.wave PORT ID ...
+python -m tests.hardware_trials.wave PORT ID ...
 """
 
 import math

@@ -1,0 +1,1 @@
+"""What driver, limits and supervisor do when things go wrong, measured against an emulated bus."""
