@@ -12,7 +12,7 @@ from rich.progress import track
 
 from elastic_env.core.errors import ElasticError, ResultsExistError, missing_extra
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import make_policy
+from train.evaluate.evaluate import blamed, make_policy
 
 _FRAMES_PER_S = 25
 
@@ -38,7 +38,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     steps = task.num_steps if max_s is None else max(round(min(max_s / period, task.num_steps)), 1)
-    episode = _episode(env, make_policy(condition.policy, env), condition.seed, steps, console)
+    episode = _episode(env, make_policy(condition.policy, env), condition, steps, console)
     try:
         if video is None:
             _window(episode, period)
@@ -48,13 +48,14 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         env.close()
 
 
-def _episode(env: Any, policy: Any, seed: int, steps: int, console: Console) -> Iterator[int]:
+def _episode(env: Any, policy: Any, condition: Condition, steps: int, console: Console) -> Iterator[int]:
     """Play step by step; yields the number of each step, and says so where the episode fails."""
-    observation, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=condition.seed)
     state, start = None, np.array(True)
     for step in range(steps):
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
-        observation, _, terminated, truncated, info = env.step(action)
+        with blamed(condition, step):
+            action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+            observation, _, terminated, truncated, info = env.step(action)
         start = np.array(False)
         yield step
         if terminated:
