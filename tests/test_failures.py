@@ -215,6 +215,15 @@ def test_a_file_that_cannot_grow_is_one_sentence(size: int, tmp_path: Path) -> N
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.parametrize(("video", "said"), [("x.gif", "File too large"), ("x.mp4", "x.mp4 is not whole, 0 of")])
+def test_a_film_that_does_not_fit_is_one_sentence(video: str, said: str, tmp_path: Path) -> None:
+    """Catches an encoder that says nothing, and a writer that prints what it raises a second time."""
+    run = elastic("play", "--video", video, "--max-s", "0.2", cwd=tmp_path, preexec_fn=limited(2_000))
+    assert run.returncode == 3, run.stderr
+    assert said in run.stderr
+    assert "Traceback" not in run.stderr
+
+
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [(34.0, "30 s"), (62.0, "60 s"), (89.0, "90 s"), (91.0, "2 min"), (5399.0, "90 min"), (7300.0, "2 h")],

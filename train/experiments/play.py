@@ -1,5 +1,6 @@
 """Watch a policy: a window, or a video file."""
 
+import io
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from elastic_env.core.errors import ElasticError, ResultsExistError, missing_extra
+from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import blamed, make_policy
 
@@ -83,10 +84,36 @@ def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Pa
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     video.parent.mkdir(parents=True, exist_ok=True)
     writer: Any
-    frame_s = every * period
-    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if video.suffix == ".gif" else {"fps": 1.0 / frame_s}
-    with imageio.get_writer(video, **timing) as writer:
+    frame_s, frames, gif = every * period, 0, io.BytesIO()
+    is_gif = video.suffix == ".gif"
+    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
+    # a GIF is made in memory in any case, and its writer would print what a full disk makes it raise
+    with imageio.get_writer(*((gif, "gif") if is_gif else (video,)), **timing) as writer:
         for step in track(episode, "filming", total=steps, console=console, transient=True):
             if step % every == 0:
                 writer.append_data(env.render())
+                frames += 1
+    if is_gif:
+        video.write_bytes(gif.getbuffer())
+    else:
+        _require_whole(video, frames)
     console.print(f"wrote {video}")
+
+
+def _require_whole(video: Path, frames: int) -> None:
+    """Check that a film has its frames: the encoder is a process whose failure nobody is told.
+
+    Raises:
+        SystemFailedError: It has others, or cannot be read.
+    """
+    from imageio_ffmpeg import count_frames_and_secs
+
+    try:
+        found, _ = count_frames_and_secs(str(video))
+    except RuntimeError:
+        found = 0
+    if found != frames:
+        raise SystemFailedError(
+            f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full: free some space, "
+            "then play again"
+        )
