@@ -88,7 +88,8 @@ def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Pa
     is_gif = video.suffix == ".gif"
     timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
     # a GIF is made in memory in any case, and its writer would print what a full disk makes it raise
-    with imageio.get_writer(*((gif, "gif") if is_gif else (video,)), **timing) as writer:
+    target: Any = gif if is_gif else video
+    with imageio.get_writer(target, "gif" if is_gif else None, **timing) as writer:
         for step in track(episode, "filming", total=steps, console=console, transient=True):
             if step % every == 0:
                 writer.append_data(env.render())
