@@ -121,6 +121,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One decision."""
+        if not self._last.size:
+            raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         residual = self._deciding.checked(action, self.action_space.shape or ())[None]
         total, terminated, truncated, info = 0.0, False, False, {}
         for _ in range(self.settings.decision_period):
@@ -213,6 +215,8 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One decision in every world."""
+        if self._last is None:
+            raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         residual = self._deciding.checked(actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
         outcome = self._decide(residual, ~waiting)

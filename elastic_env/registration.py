@@ -1,6 +1,7 @@
 """What makes a robot an environment: its configuration, its task and its picture, registered with Gymnasium."""
 
 import inspect
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +15,9 @@ from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.rendering.picture import Picture
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.runtime.task import Task
+
+_LEAST_WORLD_BYTES = 10_000
+"""Memory of a world: measured on the testbed, the smallest robot, without a policy."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,13 @@ class Robot:
         """Vector entry point; further arguments as in `configure`.
 
         Raises:
-            ConfigurationError: A number of worlds or threads that cannot be.
+            ConfigurationError: A number of worlds or threads that cannot be, or worlds beyond the memory.
         """
         bounds = ("num_envs", num_envs, 1, ""), ("num_threads", num_threads, 0, ", 0 for all")
         for name, number, least, note in bounds:
             if isinstance(number, bool) or not isinstance(number, Integral) or number < least:
                 raise ConfigurationError(f"{name} must be a whole number >= {least}{note}, got {shown(number)}")
+        require_memory("num_envs", num_envs, _LEAST_WORLD_BYTES)
         task = self.task(self._configured(arguments), num_envs)
         picture = partial(self.picture, task)
         return ElasticVectorEnv(task, num_threads, autoreset_mode, render_mode=render_mode, picture=picture)
@@ -82,3 +87,22 @@ def require_models(**arguments: tuple[Any, type[Any]]) -> None:
     for name, (given, model) in arguments.items():
         if not isinstance(given, dict | model | None):
             raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
+
+
+def require_memory(name: str, worlds: int, world_bytes: int) -> None:
+    """Refuse more worlds than the memory holds.
+
+    Args:
+        name: Parameter that says how many.
+        worlds: How many.
+        world_bytes: Memory of each [bytes].
+
+    Raises:
+        ConfigurationError: They do not fit.
+    """
+    needed, there = int(worlds) * world_bytes, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ConfigurationError(
+            f"{shown(worlds)} worlds take about {shown(needed // 10**9)} GB of memory, this computer has "
+            f"{there / 1e9:.1f} GB; set {name} to at most {there // world_bytes}"
+        )

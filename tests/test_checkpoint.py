@@ -3,6 +3,7 @@
 import random
 import resource
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -107,6 +108,16 @@ def test_a_kill_between_the_moves_loses_nothing(tmp_path: Path) -> None:
     checkpoint.rename(tmp_path / "checkpoint.old")
     assert recovered(checkpoint)
     require_whole(checkpoint)
+
+
+def test_no_thread_goes_on_writing_behind_a_training_that_was_ended(tmp_path: Path) -> None:
+    """Catches TensorBoard's thread, which would print a traceback where the disk is full, between other words."""
+    before = set(threading.enumerate())
+    with pytest.raises(KeyboardInterrupt):
+        Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).run(interrupted_after(32))
+    assert [
+        type(thread).__name__ for thread in set(threading.enumerate()) - before if "Writer" in str(type(thread))
+    ] == []
 
 
 @contextmanager

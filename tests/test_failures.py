@@ -15,6 +15,9 @@ import pytest
 from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
+from train.commands.cli import main
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.evaluate import PolicyFailedError, blamed
 from train.runs.failures import explained
 from train.runs.workers import WorkerKilledError, duration, plain_progress
 
@@ -48,6 +51,9 @@ env: testbed
 references: [{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}]
 policies: [input, "mine.py:raises"]
 """
+
+
+CELL = Condition(policy=PolicySpec(name="mine.py:policy"), reference={"kind": "sine"})
 
 
 def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
@@ -94,6 +100,45 @@ def test_a_policy_that_fails_is_named_with_scenario_and_step(kind: str, tmp_path
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.parametrize(
+    "error", [FileNotFoundError(2, "No such file"), SystemExit(7), ConfigurationError("no"), RuntimeError("no")]
+)
+def test_whatever_a_policy_raises_is_the_policys(error: BaseException) -> None:
+    """Catches a file that the policy misses taken for a disk that failed, and a policy that ends the program."""
+    with (
+        pytest.raises(
+            PolicyFailedError, match=r"'mine.py:policy' failed in scenario 'nominal', sine, at control step 3"
+        ),
+        blamed(CELL, 3),
+    ):
+        raise error
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space"), MemoryError(), SystemFailedError("gone")])
+def test_what_the_system_does_is_not_the_policys(error: Exception) -> None:
+    """Catches a full disk that is put down to the policy that met it."""
+    with pytest.raises(type(error)) as caught, blamed(CELL, 3):
+        raise error
+    assert caught.value is error
+
+
+@pytest.mark.parametrize("command", ["play", "speed"])
+def test_a_policy_that_fails_is_named_by_every_command(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a traceback in commands that play a policy without scoring it."""
+    (tmp_path / "mine.py").write_text(POLICIES)
+    monkeypatch.chdir(tmp_path)
+    given = {
+        "play": ["--video", "x.gif", "--max-s", "0.1"],
+        "speed": ["--env", "testbed", "--num-envs", "2", "--rounds", "1", "--no-others", "--no-ppo"],
+    }
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--policy", "mine.py:raises", *given[command]])
+    assert caught.value.code == 2
+    assert "the policy 'mine.py:raises' failed in scenario 'nominal', " in capsys.readouterr().err
+
+
 def test_the_other_cells_of_a_comparison_are_kept(tmp_path: Path) -> None:
     """Catches a comparison that loses what has been played because one policy fails."""
     (tmp_path / "mine.py").write_text(POLICIES)
@@ -122,6 +167,16 @@ def test_output_that_nobody_reads_is_no_traceback(tmp_path: Path) -> None:
     run = subprocess.run(f"{code} | head -n 1", shell=True, capture_output=True, text=True, timeout=120, check=True)
     assert "Traceback" not in run.stderr
     assert "BrokenPipe" not in run.stderr
+
+
+@pytest.mark.parametrize(("where", "code", "said"), [("> /dev/full", 3, "No space left on device"), (">&-", 0, "")])
+def test_output_that_cannot_be_written_is_one_sentence(where: str, code: int, said: str) -> None:
+    """Catches a traceback and "worse" where a log's disk is full, and a program that needs a standard output."""
+    program = f"{sys.executable} -c 'from train.commands.entry import main; main()' evaluate --help {where}"
+    run = subprocess.run(program, shell=True, capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == code, run.stderr
+    assert said in run.stderr
+    assert len(run.stderr.splitlines()) == bool(said)
 
 
 def test_an_interrupt_while_modules_load_is_one_word() -> None:
@@ -157,6 +212,15 @@ def test_a_file_that_cannot_grow_is_one_sentence(size: int, tmp_path: Path) -> N
     run = elastic("compare", "cells.yaml", cwd=tmp_path, preexec_fn=limited(size), env=environment)
     assert run.returncode == 3, run.stderr
     assert "File too large" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize(("video", "said"), [("x.gif", "File too large"), ("x.mp4", "x.mp4 is not whole, 0 of")])
+def test_a_film_that_does_not_fit_is_one_sentence(video: str, said: str, tmp_path: Path) -> None:
+    """Catches an encoder that says nothing, and a writer that prints what it raises a second time."""
+    run = elastic("play", "--video", video, "--max-s", "0.2", cwd=tmp_path, preexec_fn=limited(2_000))
+    assert run.returncode == 3, run.stderr
+    assert said in run.stderr
     assert "Traceback" not in run.stderr
 
 

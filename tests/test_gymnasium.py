@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from baselines import ResidualVectorWrapper, ResidualWrapper
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 
 SIMULATIONS = {
@@ -101,11 +102,24 @@ def test_the_specification_tells_the_length_of_an_episode(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
+def test_a_step_before_the_reset_is_refused(name: str) -> None:
+    """Catches a robot that moves before its equilibrium, also as one world of several, and under a residual."""
+    many = make_vec(name, 3)
+    envs = many, make(name).unwrapped, ResidualWrapper(make(name).unwrapped, "input")
+    for env in (*envs, ResidualVectorWrapper(make_vec(name, 2), "input")):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"reset\(\) comes before the first step"):
+            env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    many.reset(seed=0, options={"reset_mask": np.array([False, True, False])})
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"of the worlds \[0, 2\] too"):
+        many.step(np.zeros(many.action_space.shape, dtype=np.float32))
+    many.reset(seed=0, options={"reset_mask": np.array([True, False, True])})
+    many.step(np.zeros(many.action_space.shape, dtype=np.float32))
+
+
+@pytest.mark.parametrize("name", IDS)
 def test_a_vector_environment_draws_its_worlds(name: str) -> None:
     """Catches frames that all show the first world."""
     env = make_vec(name, 2, render_mode="rgb_array", scenario="nominal")
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(np.zeros(env.action_space.shape, dtype=np.float32))
     env.reset(seed=0)
     action = np.zeros(env.action_space.shape, dtype=np.float32)
     action[1] = 0.03

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
@@ -19,6 +20,7 @@ from elastic_env.core.json_text import parse_json
 from elastic_env.runtime.physics import substeps
 from tests.mutations import RESIDUALS
 from train.evaluate.conditions import PolicySpec
+from train.evaluate.environments import environment
 from train.evaluate.evaluate import make_policy
 from train.evaluate.families import expand
 from train.experiments.bench import BenchConfig
@@ -146,8 +148,16 @@ def test_telling_keys_are_those_of_one_kind_alone() -> None:
 def test_worlds_beyond_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a training that ends by the kernel's hand, without a word."""
     monkeypatch.setattr("os.sysconf", lambda name: 4096 if name == "SC_PAGE_SIZE" else 10**6)
-    with pytest.raises(ConfigurationError, match=r"100000 worlds take about 10\.0 GB.* has 4\.1 GB; .*at most 40960"):
+    with pytest.raises(ConfigurationError, match=r"100000 worlds take about 10 GB.* has 4\.1 GB; .*at most 40960"):
         training_worlds(TrainConfig(worlds=100_000), [("nominal", 100_000)], 1)
+
+
+@pytest.mark.parametrize("name", ["elastic_env/Testbed-v0", "elastic_env/WalkInPlace-v0"])
+def test_worlds_of_a_vector_environment_beyond_the_memory_are_refused(name: str) -> None:
+    """Catches a computer that stands still, and a number that Python does not turn into text."""
+    for worlds in (10**12, 10**5000):
+        with pytest.raises(ConfigurationError, match=r"worlds take about .* GB of memory.*set num_envs to at most"):
+            gymnasium.make_vec(name, num_envs=worlds, vectorization_mode="vector_entry_point")
 
 
 @pytest.mark.parametrize("timestep_s", [1e-310, 1e-300, 1e-9])
@@ -169,3 +179,6 @@ def test_what_an_error_shows_is_short() -> None:
     for value in (10**5000, "x" * 10**6, [[1] * 1000] * 1000, {str(i): i for i in range(1000)}):
         assert len(shown(value)) < 300
     assert shown("nominal") == "'nominal'"
+    with pytest.raises(ConfigurationError) as caught:
+        environment("walker").arguments({str(i): i for i in range(2000)})
+    assert len(str(caught.value)) < 500

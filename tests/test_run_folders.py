@@ -1,10 +1,13 @@
 """Folders of results: each for one program alone, and none elsewhere than where it should be."""
 
+import errno
 import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -54,6 +57,26 @@ def test_what_is_in_the_way_is_said(obstacle: str, tmp_path: Path) -> None:
         runs.symlink_to(tmp_path / "nowhere")
     with pytest.raises(SystemFailedError, match="no folder for results can be made at runs"):
         free_folder("x")
+
+
+def test_a_run_that_cannot_be_described_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches a folder with a configuration alone, where the disk got full behind it."""
+    monkeypatch.setattr(Path, "write_text", full_at("metadata.json"))
+    with pytest.raises(OSError, match="No space"):
+        new_run("x", {"a": 1}, 0)
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+def full_at(name: str) -> Callable[..., int]:
+    """`Path.write_text` on a disk that gets full at a file."""
+    write = Path.write_text
+
+    def write_text(path: Path, text: str, **options: Any) -> int:
+        if path.name == name:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return write(path, text, **options)
+
+    return write_text
 
 
 HOLD = """

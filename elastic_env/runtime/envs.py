@@ -168,7 +168,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         picture: Makes the picture of the task when it is first rendered.
     """
 
-    STATE = ("_worlds", "_generators", "_done", "_is_begun")
+    STATE = ("_worlds", "_generators", "_done")
 
     def __init__(
         self,
@@ -194,7 +194,6 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._worlds = Worlds(task, num_threads, simulation=simulation)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
-        self._is_begun = False
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -212,15 +211,12 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
             if seeds[world] is not None:
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask, robots)
-        self._is_begun = True
         return self._worlds.task.observe(), self._worlds.signals()
 
     def step(
         self, actions: Action
     ) -> tuple[Observation, npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], dict[str, Any]]:
         """One control period in every world under command offsets, (num_envs, n) [rad]."""
-        if not self._is_begun:
-            raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         restarting, given = self._done, np.asarray(actions)
         some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
         if some_restart and given.shape == self.action_space.shape:

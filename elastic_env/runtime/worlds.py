@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
 
@@ -61,7 +62,7 @@ class Worlds(Stateful):
         simulation: What moves instead of MuJoCo, such as hardware.
     """
 
-    STATE = ("task", "simulation", "_metrics")
+    STATE = ("task", "simulation", "_metrics", "_begun")
 
     def __init__(
         self, task: Task, num_threads: int = 0, is_scalar: bool = False, simulation: Simulation | None = None
@@ -72,6 +73,7 @@ class Worlds(Stateful):
         self._bound = task.action_table.space(np.float32).high.astype(np.float64)
         self._shape = (task.num_worlds, len(self._bound))
         self._metrics = EpisodeMetrics(task.metrics, task.num_worlds)
+        self._begun, self._is_begun = np.zeros(task.num_worlds, dtype=np.bool_), False
         self._samples: list[tuple[Any, ...]] = []  # of `_Sample`s to be
         at_once = min(max(_SCORED_ROWS // task.num_worlds, _FEWEST_STEPS), _MOST_STEPS)
         # many take 2 ms, half a control period of hardware
@@ -86,6 +88,11 @@ class Worlds(Stateful):
         self.score_samples()
         return super().get_state()
 
+    def set_state(self, state: dict[str, Any]) -> None:
+        """See `Stateful`."""
+        super().set_state(state)
+        self._is_begun = bool(self._begun.all())
+
     @property
     def num_worlds(self) -> int:
         """Number of worlds."""
@@ -97,6 +104,8 @@ class Worlds(Stateful):
         self.simulation.restart(worlds)
         self.task.restart(self.simulation, worlds, draws)
         self._metrics.restart(worlds)
+        self._begun = self._begun | worlds
+        self._is_begun = bool(self._begun.all())
 
     def signals(self) -> Signals:
         """Truth and scores of the present state by name, (num_worlds,) each."""
@@ -107,7 +116,11 @@ class Worlds(Stateful):
 
         Raises:
             ActionError: Wrong shape, or a value that is not finite.
+            ResetNeeded: A world has not begun an episode yet.
         """
+        if not self._is_begun:
+            some = f", of the worlds {np.flatnonzero(~self._begun).tolist()} too" if self._begun.any() else ""
+            raise gymnasium.error.ResetNeeded(f"reset() comes before the first step(){some}")
         offset, is_clipped = self._checked(action)
         self.task.command(offset, self.simulation.ctrl)
         self.task.disturb(self.simulation)

@@ -85,18 +85,21 @@ def _ended_by(*numbers: int) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the command `elastic`."""
-    if "" not in sys.path and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
-    command: Any = tyro.cli(
+def _command(arguments: list[str] | None) -> Any:
+    return tyro.cli(
         Command, prog="elastic", args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
     )  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the command `elastic`."""
+    if "" not in sys.path and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
-            command.run()
+            _command(arguments).run()
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
         except Exception as error:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any, TypeAlias
 
 from elastic_env import IDS
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
 from elastic_env.robots.joint_robot import JointRobot
@@ -207,7 +207,7 @@ def _step_period(reference: Reference) -> Any:
         return reference
     if "step_period" not in reference:
         raise ConfigurationError(
-            f"a reference of the walker that is a mapping needs the key 'step_period', got {reference!r}; "
+            f"a reference of the walker that is a mapping needs the key 'step_period', got {shown(reference)}; "
             "for example {step_period: 24, num_steps: 2}"
         )
     return reference["step_period"]

@@ -18,6 +18,7 @@ from elastic_env.core.signals import Array, BoolArray
 from elastic_env.runtime.robot_model import WalkerModel
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.support_changes import SupportChanges
+from train.runs.failures import is_full
 from train.runs.user_code import named_object
 
 _MAX_WORLDS = 64
@@ -187,7 +188,7 @@ def _play_in(
 ) -> None:
     policy = make_policy(condition.policy, env, condition.policy_options)
     if hasattr(policy, "rehearse"):
-        with _blamed(condition, 0):
+        with blamed(condition, 0):
             policy.rehearse(env, condition.seed + first)
     task = env.unwrapped.task
     keeper = _FirstWorld(task, condition.environment.traced) if first == 0 else None
@@ -202,7 +203,7 @@ def _play_in(
             keeper.take(observation, info)
         if imu is not None:
             imu.take(observation, info)
-        with _blamed(condition, step):
+        with blamed(condition, step):
             action, state = policy.predict(observation, state=state, episode_start=episode_start, deterministic=True)
             if estimates is not None:
                 estimates.take(step, policy.link_estimate(observation, state), observation, env.unwrapped.truth())
@@ -226,21 +227,28 @@ def _play_in(
 
 
 @contextmanager
-def _blamed(condition: Condition, step: int) -> Iterator[None]:
+def blamed(condition: Condition, step: int | None = None) -> Iterator[None]:
     """Say of what a policy does within whose it is, and where.
 
+    Args:
+        condition: What is played.
+        step: Control step; None where nobody counts.
+
     Raises:
-        PolicyFailedError: It raises, or its action is none.
+        PolicyFailedError: It raises, ends the program, or its action is none.
     """
     try:
         yield
-    except (SystemFailedError, ConfigurationError, OSError, MemoryError):
+    except (SystemFailedError, MemoryError):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if is_full(error):
+            raise
         kind = "" if isinstance(error, ElasticError) else f"{type(error).__name__}: "
+        when = "" if step is None else f", at control step {step}"
         raise PolicyFailedError(
             f"the policy {condition.policy.title!r} failed in scenario {condition.scenario!r}, "
-            f"{condition.reference_name}, at control step {step}: {kind}{error}"
+            f"{condition.reference_name}{when}: {kind}{error}"
         ) from error
 
 

@@ -1,5 +1,6 @@
 """Watch a policy: a window, or a video file."""
 
+import io
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +11,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from elastic_env.core.errors import ElasticError, ResultsExistError, missing_extra
+from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import make_policy, make_vector_env
+from train.evaluate.evaluate import blamed, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
 
@@ -42,7 +43,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
             _rehearse(policy, condition, console)
-        episode = _episode(env, policy, condition.seed, steps, console)
+        episode = _episode(env, policy, condition, steps, console)
         if video is None:
             _window(episode, period)
         else:
@@ -61,13 +62,14 @@ def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
         unseen.close()
 
 
-def _episode(env: Any, policy: Any, seed: int, steps: int, console: Console) -> Iterator[int]:
+def _episode(env: Any, policy: Any, condition: Condition, steps: int, console: Console) -> Iterator[int]:
     """Play step by step; yields the number of each step, and says so where the episode fails."""
-    observation, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=condition.seed)
     state, start = None, np.array(True)
     for step in range(steps):
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
-        observation, _, terminated, truncated, info = env.step(action)
+        with blamed(condition, step):
+            action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+            observation, _, terminated, truncated, info = env.step(action)
         start = np.array(False)
         yield step
         if terminated:
@@ -95,10 +97,37 @@ def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Pa
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     video.parent.mkdir(parents=True, exist_ok=True)
     writer: Any
-    frame_s = every * period
-    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if video.suffix == ".gif" else {"fps": 1.0 / frame_s}
-    with imageio.get_writer(video, **timing) as writer:
+    frame_s, frames, gif = every * period, 0, io.BytesIO()
+    is_gif = video.suffix == ".gif"
+    timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
+    # a GIF is made in memory in any case, and its writer would print what a full disk makes it raise
+    target: Any = gif if is_gif else video
+    with imageio.get_writer(target, "gif" if is_gif else None, **timing) as writer:
         for step in track(episode, "filming", total=steps, console=console, transient=True):
             if step % every == 0:
                 writer.append_data(env.render())
+                frames += 1
+    if is_gif:
+        video.write_bytes(gif.getbuffer())
+    else:
+        _require_whole(video, frames)
     console.print(f"wrote {video}")
+
+
+def _require_whole(video: Path, frames: int) -> None:
+    """Check that a film has its frames: the encoder is a process whose failure nobody is told.
+
+    Raises:
+        SystemFailedError: It has others, or cannot be read.
+    """
+    from imageio_ffmpeg import count_frames_and_secs
+
+    try:
+        found, _ = count_frames_and_secs(str(video))
+    except RuntimeError:
+        found = 0
+    if found != frames:
+        raise SystemFailedError(
+            f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full: free some space, "
+            "then play again"
+        )

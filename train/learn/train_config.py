@@ -1,6 +1,5 @@
 """What is trained on what: the configuration of a training, and the worlds that it learns from."""
 
-import os
 from typing import Annotated, Any, Self
 
 from gymnasium.vector import AutoresetMode
@@ -12,6 +11,7 @@ from baselines.residual.residual import ResidualDescription, require_plain_base
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.registration import require_memory
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
 from train.learn.mixed_env import mixed_env
@@ -137,15 +137,6 @@ _WORLD_BYTES = 100_000
 """Memory of a world: measured on the walker with its policy, and on the testbed with a motion of its own."""
 
 
-def _require_memory(worlds: int) -> None:
-    needed, there = worlds * _WORLD_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > there:
-        raise ConfigurationError(
-            f"{worlds} worlds take about {needed / 1e9:.1f} GB of memory, this computer has {there / 1e9:.1f} GB; "
-            f"set worlds to at most {there // _WORLD_BYTES}"
-        )
-
-
 def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> ResidualVectorWrapper:
     """Worlds under residuals of the configuration's base.
 
@@ -157,7 +148,7 @@ def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads:
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    _require_memory(sum(count for _, count in shares))
+    require_memory("worlds", sum(count for _, count in shares), _WORLD_BYTES)
     conditions = [config.condition(scenario, config.base) for scenario, _ in shares]
     apart = {**environment(config.env).learned_from, **config.env_options}
     worlds = mixed_env(

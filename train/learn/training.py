@@ -10,7 +10,7 @@ import random
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -73,14 +73,24 @@ class Training(Trainer):
             self._shrink_last_layer()
         self.model.action_space.seed(seed)
         folder.mkdir(parents=True, exist_ok=True)
-        self.model.set_logger(configure(str(folder / "tensorboard"), ["tensorboard"]))
         self._go_on()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
         """See `Trainer`; what TensorBoard's thread could not write, such as to a full disk, is raised here."""
-        with _thread_raises_here():
+        with _thread_raises_here(), self._curves():
             super().run(progress)
-            self.model.logger.close()
+
+    @contextmanager
+    def _curves(self) -> Iterator[None]:
+        """Write TensorBoard's files of the work within. Its thread ends with it, whatever ended that."""
+        self.model.set_logger(configure(str(self.folder / "tensorboard"), ["tensorboard"]))
+        try:
+            yield
+        except BaseException:
+            with suppress(Exception):  # what ended the work is what is said
+                self.model.logger.close()
+            raise
+        self.model.logger.close()
 
     @property
     def done(self) -> int:

@@ -28,6 +28,8 @@ _CURES = {
     errno.EACCES: "name a folder that can be written, by --output",
 }
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
 
 def explained(error: BaseException) -> tuple[str, int] | None:
     """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
@@ -52,6 +54,11 @@ def explained(error: BaseException) -> tuple[str, int] | None:
 def is_interrupt(error: BaseException) -> bool:
     """Whether it is Ctrl-C, which a module that is being loaded may turn into an error of its own."""
     return any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error))
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether it comes from a disk, a quota or a limit on files that leaves no room."""
+    return any(isinstance(cause, OSError) and cause.errno in _NO_ROOM for cause in _causes(error))
 
 
 def _extra_of(error: ModuleNotFoundError) -> str:

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from importlib import metadata
@@ -41,8 +41,16 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
         ResultsExistError: The named output folder is not empty.
     """
     folder = free_folder(name, output)
-    (folder / "config.yaml").write_text(yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True))
-    (folder / "metadata.json").write_text(json.dumps(provenance(seed), indent=2) + "\n")
+    texts = {
+        "config.yaml": yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
+        "metadata.json": json.dumps(provenance(seed), indent=2) + "\n",
+    }
+    try:
+        for file, text in texts.items():
+            (folder / file).write_text(text)
+    except BaseException:
+        _remove(folder, texts)
+        raise
     return folder
 
 
@@ -130,10 +138,15 @@ def run_folder(
     except BaseException:
         made = described | {folder / _LOCK}
         if set(folder.iterdir()) <= made:
-            for file in made:
-                file.unlink(missing_ok=True)
-            folder.rmdir()
+            _remove(folder, [file.name for file in made])
         raise
+
+
+def _remove(folder: Path, files: Iterable[str]) -> None:
+    """Remove a folder with the files that it may have."""
+    for name in files:
+        (folder / name).unlink(missing_ok=True)
+    folder.rmdir()
 
 
 def _next_free(name: str) -> Path:

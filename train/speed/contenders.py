@@ -16,7 +16,7 @@ from baselines.residual.residual import Network, ResidualDescription, ResidualPo
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import make_policy, make_vector_env
+from train.evaluate.evaluate import blamed, make_policy, make_vector_env
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -49,7 +49,8 @@ class VectorLoop:
     ) -> None:
         self.title = f"vector env{_with(policy, residual)}"
         self.num_envs = num_envs
-        self.env = make_vector_env(_condition(env, policy), num_envs, threads)
+        self._condition = _condition(env, policy)
+        self.env = make_vector_env(self._condition, num_envs, threads)
         self._policy = None if policy is None else make_policy(PolicySpec(name=policy), self.env)
         if residual:
             self._policy = untrained_residual(self._policy, self.env)
@@ -64,9 +65,10 @@ class VectorLoop:
         ctrl = self.env.unwrapped.simulation.ctrl
         self.controls = np.empty((steps, *ctrl.shape))
         begin = time.perf_counter()
-        for step in range(steps):
-            self.step()
-            self.controls[step] = ctrl
+        with blamed(self._condition):
+            for step in range(steps):
+                self.step()
+                self.controls[step] = ctrl
         return self.num_envs * steps / (time.perf_counter() - begin)
 
     def step(self) -> None:

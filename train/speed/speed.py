@@ -39,17 +39,17 @@ class SpeedConfig(Model):
     policy: str | None = None
     """Policy in the loop of the vector environment, which is timed without, with it, and with a residual network; None
     for input_wrench on the walker, input on the testbed."""
-    num_envs: list[Annotated[int, Field(ge=1)]] = Field(default=[64, 256], min_length=1)
+    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field(default=[64, 256], min_length=1, max_length=100)
     """Numbers of worlds."""
     others: bool = True
     """Whether scalar environments are timed too, alone and under Gymnasium's and SB3's vector environments."""
-    processes: list[Annotated[int, Field(ge=1)]] = Field(default=[2, 4], min_length=1)
+    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field(default=[2, 4], min_length=1, max_length=100)
     """Numbers of processes to try with them; the fastest counts."""
     ppo: bool = True
     """Whether PPO is timed end to end, with ours and with processes."""
-    steps: int = quantity("1", 50, ge=1, description="control steps per round")
-    rounds: int = quantity("1", 7, ge=1, description="rounds, of which medians are reported")
-    threads: int = quantity("1", 0, ge=0, description="threads of the physics, 0 for all cores")
+    steps: int = quantity("1", 50, ge=1, le=100_000, description="control steps per round")
+    rounds: int = quantity("1", 7, ge=1, le=1000, description="rounds, of which medians are reported")
+    threads: int = quantity("1", 0, ge=0, le=1024, description="threads of the physics, 0 for all cores")
 
 
 @dataclass(frozen=True)
