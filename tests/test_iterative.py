@@ -62,9 +62,9 @@ def middle(values: Array) -> Array:
 def errors(disturbance: Array, plant: float, gains: ChannelGains, trials: int) -> list[Array]:
     """Errors of a static plant from trial to trial, e = d − p u."""
     table, found = np.zeros_like(disturbance), []
-    for _ in range(trials):
+    for trial in range(trials):
         found.append(disturbance - plant * table)
-        table = updated(table, found[-1], [gains], PERIOD_S)
+        table = updated(table, found[-1], [gains], PERIOD_S, trial)
     return found
 
 
@@ -85,6 +85,14 @@ def test_forgetting_leaves_the_share_of_the_closed_form() -> None:
     """Catches forgetting that acts on the correction too: at rest the error is λ / (λ + γ p)."""
     error = errors(np.ones((10_000, 1)), 1.0, GAIN.replace(forgetting=0.1), 40)[-1]
     np.testing.assert_allclose(middle(error), 0.1 / (0.1 + GAIN.gain), atol=1e-6)
+
+
+def test_a_falling_gain_multiplies_what_each_trial_leaves() -> None:
+    """Catches a gain that falls too fast or from the wrong trial: at rest the error is Π (1 − γ p / (1 + j/n))."""
+    found = errors(np.ones((10_000, 1)), 0.8, GAIN.replace(halved_after=2.0), 6)
+    left = np.cumprod([1.0] + [1.0 - GAIN.gain * 0.8 / (1.0 + trial / 2.0) for trial in range(5)])
+    for error, share in zip(found, left, strict=True):
+        np.testing.assert_allclose(middle(error), share, atol=1e-6)
 
 
 def test_the_right_sign_converges_and_the_wrong_one_diverges() -> None:

@@ -143,7 +143,10 @@ class IterativeLearner(LearnedOffsets):
         known = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
         error = credible(trial.error, known, surprise)
         following = np.stack(
-            [updated(*pair, self._signals.gains, self._period_s) for pair in zip(tables, error, strict=True)]
+            [
+                updated(*pair, self._signals.gains, self._period_s, trial.number)
+                for pair in zip(tables, error, strict=True)
+            ]
         )
         failed = trial.failed[:, None, None]
         return np.where(failed, _RETREAT * tables, following), np.where(failed, before, error)

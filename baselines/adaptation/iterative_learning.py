@@ -3,10 +3,10 @@ r"""Iterative learning control: what went wrong in a trial corrects the offsets 
 .. math:: u_{j+1}(t) = Q \, [\, (1 - \lambda) \, u_j(t) + \gamma \, e_j(t + \ell) \,]
 
 u is a table of offsets over the time of a trial and e the error that the sensors showed in trial j. γ is the learning
-gain. A share λ is forgotten, so that noise does not add up where the plant hardly answers. The lead ℓ makes up for the
-delay from an offset to its effect. Q is a low-pass filter without phase shift, which stops learning where the delay is
-not known well enough [Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where, at
-all frequencies,
+gain. It may fall as 1 / (1 + j/n), which averages the noise of later trials [Saab2001]. A share λ is forgotten, so
+that noise does not add up where the plant hardly answers. The lead ℓ makes up for the delay from an offset to its
+effect. Q is a low-pass filter without phase shift, which stops learning where the delay is not known well enough
+[Longman2000, Elci2002]. With a plant e = d − P u the error shrinks from trial to trial where, at all frequencies,
 
 .. math:: | Q \, (1 - \lambda - \gamma \, e^{i \omega \ell} P) | < 1
 
@@ -19,6 +19,7 @@ counts as grown, or as turned over, by no more than a surprise.
 Magazine 26(3).
 [Longman2000] R. W. Longman, "Iterative Learning Control and Repetitive Control for Engineering Practice", International
 Journal of Control 73(10).
+[Saab2001] S. S. Saab, "A Discrete-Time Stochastic Learning Control Algorithm", IEEE Trans. Automatic Control 46(6).
 [Elci2002] H. Elci, R. W. Longman, M. Q. Phan, J.-N. Juang, R. Ugoletti, "Simple Learning Control Made Practical by
 Zero-Phase Filtering: Applications to Robotics", IEEE Trans. Circuits and Systems I 49(6).
 """
@@ -43,6 +44,11 @@ class ChannelGains(Model):
     surprise: float = quantity("error", gt=0, description="by how much an error can grow from trial to trial")
     limit: float = quantity("offset", gt=0, description="largest offset")
     forgetting: float = quantity("1", 0.0, ge=0, lt=1, description="share λ of the offset that is forgotten")
+    halved_after: float | None = quantity("trials", None, gt=0, description="trials n that halve γ; None keeps it")
+
+    def gain_of(self, trial: int) -> float:
+        """Learning gain of a trial, 0 for the first."""
+        return self.gain if self.halved_after is None else self.gain / (1.0 + trial / self.halved_after)
 
 
 def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
@@ -75,7 +81,7 @@ def credible(error: Array, before: Array, surprise: float | Array) -> Array:
     return np.clip(np.nan_to_num(error), low, high)
 
 
-def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float) -> Array:
+def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float, trial: int = 0) -> Array:
     """Offsets of the next trial, see the module.
 
     Args:
@@ -83,10 +89,11 @@ def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s:
         error: What is to be corrected, at the same times, (T, k).
         gains: Of the columns.
         period_s: Time between rows [s].
+        trial: Number of this trial, 0 for the first.
     """
     following = np.empty_like(table)
     for column, own in enumerate(gains):
-        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain * ahead(
+        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain_of(trial) * ahead(
             error[:, column], round(own.lead_s / period_s)
         )
         following[:, column] = np.clip(zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit)
