@@ -7,12 +7,12 @@ change more slowly than what it is estimated from [Spong1995].
 [Spong1995] M. W. Spong, "Adaptive Control of Flexible Joint Manipulators: Comments on Two Papers", Automatica 31(4).
 """
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from baselines.adaptation.estimators import Estimator
-from baselines.compensation.policy import Action, ObservationView, taken_up
+from baselines.compensation.policy import Action, Correctable, ObservationView, taken_up
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import RobotModel
@@ -26,26 +26,7 @@ class AdaptationGains(Model):
     limit: float = quantity("1", 1.0, gt=0, lt=10, description="largest correction of the deflection")
 
 
-class Correctable(Protocol):
-    """A policy whose assumed deflection can be corrected, such as `baselines.Compensated`."""
-
-    def predict_corrected(
-        self,
-        observation: Array,
-        correction: Array | None,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Any, Any]:
-        """`predict` with the deflection (1 + r) δ."""
-        ...
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that it saw."""
-        ...
-
-
-class OnlineStiffness:
+class OnlineStiffness(Correctable):
     """A compensated policy whose model of the joints is corrected by what is measured, see the module.
 
     Memory per world: steps, target and filtered r of the joints, then that of the estimator.
@@ -66,12 +47,6 @@ class OnlineStiffness:
         self._every = max(round(gains.period_s / model.control_period_s), 1)
         self._gain, self._limit = 1.0 - float(np.exp(-model.control_period_s / gains.filter_s)), gains.limit
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Action and new state."""
-        return self.predict_corrected(observation, None, state, episode_start, deterministic)
-
     def predict_corrected(
         self,
         observation: Array,
@@ -80,7 +55,7 @@ class OnlineStiffness:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """`predict` with a further correction r' on top: (1 + r) (1 + r') δ; arguments as `Compensated` has them."""
+        """See `Correctable`; a further correction r' comes on top, (1 + r) (1 + r') δ."""
         rows, n = self._view.rows(observation), self._n
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._begin(len(rows)))
         memory = self._adapted(rows, memory)
@@ -90,7 +65,7 @@ class OnlineStiffness:
         return action, (memory, inner)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw, (..., n) [rad]."""
+        """See `Correctable`."""
         return self._policy.link_estimate(observation, state[1])
 
     def _begin(self, num_worlds: int) -> Array:

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.compensators import Compensator
-from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from baselines.compensation.policy import Action, Correctable, ObservationView, Policy, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
 
 
-class Compensated:
+class Compensated(Correctable):
     """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
 
     The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees the estimated link
@@ -41,16 +41,6 @@ class Compensated:
         self._view = ObservationView(model.observation_table, model.control_period_s)
         self._ramp = Ramp(model, ramp_s)
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Compensated action and new state.
-
-        Raises:
-            ElasticError: Called in the middle of an episode without the state of the last call.
-        """
-        return self.predict_corrected(observation, None, state, episode_start, deterministic)
-
     def predict_corrected(
         self,
         observation: Array,
@@ -59,16 +49,7 @@ class Compensated:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """`predict` with another model of the joints: the deflection that is compensated, and seen, is (1 + r) δ.
-
-        Args:
-            observation: As in `predict`.
-            correction: Relative change r of the deflection, (num_worlds, n) [1]; None for none. Zeros are the same to
-                the last bit.
-            state: As in `predict`.
-            episode_start: As in `predict`.
-            deterministic: As in `predict`.
-        """
+        """See `Correctable`."""
         rows, n = self._view.rows(observation), self._num_joints
         desired, compensator = self._view.motion(rows), self.compensator.at(rows)
         memory, inner_state = taken_up(
@@ -92,12 +73,7 @@ class Compensated:
         return total.reshape((*observation.shape[:-1], n)), (np.hstack([steps, links, kept]), inner_state)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angle that the policy saw in the place of an observation's encoders, (..., n) [rad].
-
-        Args:
-            observation: As in `predict`.
-            state: What `predict` returned for it.
-        """
+        """See `Correctable`."""
         memory, _ = state
         return memory[:, 1 : 1 + self._num_joints].reshape((*observation.shape[:-1], self._num_joints))
 

@@ -4,6 +4,7 @@ Policies take observations of one world, (m,), or of many, (num_worlds, m). Thos
 row per world: pass the returned state back, and `episode_start` where episodes begin, as Stable-Baselines3 does.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -25,6 +26,49 @@ class Policy(Protocol):
     ) -> tuple[Any, Any]:
         """Action and new state for an observation."""
         ...
+
+
+class Correctable(ABC):
+    """A policy that compensates a modelled deflection, which can be corrected."""
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Action, Any]:
+        """Action and new state.
+
+        Raises:
+            ElasticError: Called in the middle of an episode without the state of the last call.
+        """
+        return self.predict_corrected(observation, None, state, episode_start, deterministic)
+
+    @abstractmethod
+    def predict_corrected(
+        self,
+        observation: Array,
+        correction: Array | None,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Action, Any]:
+        """`predict` with another model of the joints: the deflection that is compensated, and seen, is (1 + r) δ.
+
+        Args:
+            observation: As in `predict`.
+            correction: Relative change r of the deflection, (num_worlds, n) [1]; None for none. Zeros are the same to
+                the last bit.
+            state: As in `predict`.
+            episode_start: As in `predict`.
+            deterministic: As in `predict`.
+        """
+
+    @abstractmethod
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angles that the policy saw in the place of an observation's encoders, (..., n) [rad].
+
+        Args:
+            observation: As in `predict`.
+            state: What `predict` returned for it.
+        """
 
 
 class Zero:

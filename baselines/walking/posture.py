@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.policy import Action, ObservationView, taken_up
+from baselines.compensation.policy import Action, Correctable, ObservationView, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -36,7 +36,7 @@ class PostureGains(Model):
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
 
-class PostureFeedback:
+class PostureFeedback(Correctable):
     """Any policy of a walker with its posture held by the hips, see the module.
 
     Memory per world: steps, filtered roll and pitch, their integrals.
@@ -58,14 +58,6 @@ class PostureFeedback:
         self._filter = 1.0 - float(np.exp(-self._dt / self._gains.filter_s))
         self._ramp = Ramp(model, ramp_s)
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Action and new state."""
-        rows, memory, inner = self._taken_up(observation, state, episode_start)
-        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
-        return self._with_feedback(action, rows, memory, inner)
-
     def predict_corrected(
         self,
         observation: Array,
@@ -74,22 +66,25 @@ class PostureFeedback:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """`predict` with another model of the joints in the policy, see `Compensated.predict_corrected`."""
-        rows, memory, inner = self._taken_up(observation, state, episode_start)
-        action, inner = self._policy.predict_corrected(observation, correction, inner, episode_start, deterministic)
-        return self._with_feedback(action, rows, memory, inner)
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw, (..., 12) [rad]."""
-        return self._policy.link_estimate(observation, state[1])
-
-    def _taken_up(self, observation: Array, state: Any, episode_start: Any) -> tuple[Array, Array, Any]:
+        """See `Correctable`; without a correction the policy need not know of any."""
         rows = self._view.rows(observation)
         begun = np.zeros((len(rows), 5))
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
-        return rows, memory, inner
+        call = inner, episode_start, deterministic
+        if correction is None:
+            action, inner = self._policy.predict(observation, *call)
+        else:
+            action, inner = self._policy.predict_corrected(observation, correction, *call)
+        turn, memory = self._turned(rows, memory)
+        total = np.asarray(action, dtype=np.float64) + hip_offsets(turn).reshape(np.shape(action))
+        return total.astype(np.float32), (memory, inner)
 
-    def _with_feedback(self, action: Action, rows: Array, memory: Array, inner: Any) -> tuple[Action, Any]:
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """See `Correctable`."""
+        return self._policy.link_estimate(observation, state[1])
+
+    def _turned(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+        """Turn of both hips against roll and pitch, (num_worlds, 2) [rad], and the new memory."""
         gains = self._gains
         steps, tilt, integral = memory[:, :1] + 1.0, memory[:, 1:3], memory[:, 3:5]
         tilt = tilt + self._filter * (rows[:, self._attitude] - tilt)
@@ -98,8 +93,7 @@ class PostureFeedback:
         integral = np.clip(integral, -most, most)
         turn = gains.proportional * tilt + gains.integral * integral + gains.derivative * rows[:, self._rate]
         turn = self._ramp.share(steps) * np.clip(turn, -gains.limit_rad, gains.limit_rad)
-        total = np.asarray(action, dtype=np.float64) + hip_offsets(turn).reshape(np.shape(action))
-        return total.astype(np.float32), (np.hstack([steps, tilt, integral]), inner)
+        return turn, np.hstack([steps, tilt, integral])
 
 
 def hip_offsets(turn: Array) -> Array:
