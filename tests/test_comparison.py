@@ -568,15 +568,16 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return root / "runs" / "two", (root / "printed.txt").read_text()
 
 
-def test_compare_plays_every_training_seed_and_the_base(compared: tuple[Path, str]) -> None:
+def test_compare_plays_every_training_seed_its_base_and_the_rival(compared: tuple[Path, str]) -> None:
     """Catches rows that cannot be told apart, a base that is missing, and a statistic that the episodes do not bear."""
     folder, printed = compared
     with (folder / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {(row["policy"], row["training_seed"], row["base"]) for row in rows} == {
-        ("uncompensated", "", ""), ("input", "", ""), ("learned", "0", "input"), ("learned", "1", "input"),
+        ("uncompensated", "", ""), ("input", "", ""), ("friction", "", ""), ("learned", "0", "input"),
+        ("learned", "1", "input"),
     }  # fmt: skip
-    assert len(rows) == 4 * 2
+    assert len(rows) == 5 * 2
     mean = {
         seed: np.mean([float(r["link_error_rms_rad"]) for r in rows if r["scenario"] == "nominal" and (
             r["training_seed"] == seed and r["policy"] in ("learned", "input"))])

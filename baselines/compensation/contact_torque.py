@@ -91,7 +91,9 @@ class ContactGravity:
         """
         biped = self._model.biped
         weights = shares(rows[:, self._share][:, 0])
-        rest = rows[:, self._zmp] - weights @ biped.footholds  # of the ZMP from the feet's weighted middle
+        # not by @, whose last bit depends on the number of rows
+        middle = (weights[:, :, None] * biped.footholds).sum(axis=1)
+        rest = rows[:, self._zmp] - middle
         in_sole = np.zeros((len(rows), _LEGS, 3))
         if self._method == "com":
             in_sole[..., :2] = rest[:, None]
