@@ -201,13 +201,17 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
     """The tables of the leaderboard."""
     main, single = board(found), scenarios_board(found)
     parts = [legend(found), _board_markdown(main)]
-    head, rows = paired_rows(found)
-    if rows:
-        rules = ["---"] * 3 + ["---:"] * 2
-        parts += ["### What learning adds", PAIRED, markdown_table(head, rules, rows)]
+    if any(s.training_seeds for s in found):
+        parts += ["### What learning adds", claims_markdown(found).rstrip()]
     if single is not None:
         parts += [f"### Single scenarios, {main.columns[0][1]}", _board_markdown(single)]
     return "\n\n".join(parts) + "\n"
+
+
+def claims_markdown(found: Sequence[Standing]) -> str:
+    """What learning adds, as a table."""
+    head, rows = paired_rows(found)
+    return "\n\n".join([PAIRED, markdown_table(head, ["---"] * 3 + ["---:"] * 2, rows)]) + "\n"
 
 
 def _board_markdown(shown: Board) -> str:
