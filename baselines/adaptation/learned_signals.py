@@ -35,10 +35,14 @@ class LearningGains(Model):
     trials: int = quantity("1", 10, ge=1, le=1000, description="trials, such as walks, that it learns from")
     attitude: ChannelGains = ChannelGains(gain=2.0, lead_s=0.032, cutoff_hz=6.0, surprise=1.5e-3, limit=0.08)
     """Walker: hip angle per tilt of the pelvis [1], in rad."""
-    zmp: ChannelGains = ChannelGains(
+    zmp_x: ChannelGains = ChannelGains(
         gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1, halved_after=3.0
     )
-    """Walker: shift of the planned ZMP per deviation of the ZMP [1], in m."""
+    """Walker: forward shift of the planned ZMP per deviation of the ZMP [1], in m."""
+    zmp_y: ChannelGains = ChannelGains(
+        gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1, halved_after=3.0
+    )
+    """Walker: the same to the left."""
     joint: ChannelGains = ChannelGains(gain=0.5, lead_s=0.08, cutoff_hz=1.4, surprise=0.01, limit=0.2)
     """Robots on a fixed base: offset per error of the link [1], in rad."""
 
@@ -77,7 +81,7 @@ class WalkSignals:
     names: tuple[str, ...] = ("roll_rad", "pitch_rad", "zmp_x_m", "zmp_y_m")
 
     def __init__(self, model: WalkerModel, gains: LearningGains) -> None:
-        self.gains = (gains.attitude, gains.attitude, gains.zmp, gains.zmp)
+        self.gains = (gains.attitude, gains.attitude, gains.zmp_x, gains.zmp_y)
         self._model, table = model, model.observation_table
         self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
         self._zmp = table.group("zmp_reference")
