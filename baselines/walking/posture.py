@@ -4,8 +4,8 @@ The same offset u on the hip rolls, and on the hip pitches, of legs that stand t
 
 .. math:: u = k_p \hat\varphi + k_i \int \hat\varphi \, dt + k_d \hat\omega, \quad u_i = \min(2 \mu_i, 1) \, u
 
-The planned load share μ_i of a leg says whether it stands. A leg in the air keeps its place under a level pelvis: turned
-as well, it would land beside its foothold, and the ZMP would wander off with the feet.
+The planned load share μ_i of a leg says whether it stands. A leg in the air keeps its place under a level pelvis. With
+the offset it would land beside its foothold, and the ZMP would wander off with the feet.
 
 φ is the attitude of the IMU behind a first-order filter, ω its rate. The integral leaks, as it winds up against homing
 errors and the integrator of the foot force control else. Walking robots do this widely, also the published controller
