@@ -4,12 +4,14 @@ import csv
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from train.evaluate.changes import percent_interval
+from train.evaluate.environments import Column
 from train.evaluate.robots import RobotScores
 from train.evaluate.statistics import Estimate
 from train.report.parts import number_interval
@@ -40,17 +42,34 @@ def robots_table(found: Sequence[RobotScores]) -> tuple[list[str], list[list[str
 
 
 def print_robots(found: Sequence[RobotScores], console: Console) -> None:
-    """Print the table, where there is anything in it."""
+    """Print a line per policy with all metrics, under the motion and the scenario, where there is anything to print."""
     if not found:
         return
-    head, rows = robots_table(found)
-    table = Table(title="over drawn robots that did not fail", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for number, name in enumerate(head):
-        is_figure = WORDS <= number < len(head) - 1
-        table.add_column(name, justify="right" if is_figure else "left", vertical="bottom", overflow="fold")
-    for row in rows:
-        table.add_row(*map(escape, row))
+    columns = list(dict.fromkeys(row.column for row in found))
+    title = "over the drawn robots that did not fail: mean / interquartile mean / mean of the worst tenth"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("policy", vertical="bottom", overflow="fold")
+    for column in columns:
+        table.add_column(f"{column.title}\n{column.unit}", justify="right", no_wrap=True, vertical="bottom")
+    table.add_column(found[0].failure, justify="right", no_wrap=True, vertical="bottom")
+    cells: dict[tuple[str, str], dict[str, dict[Column, RobotScores]]] = {}
+    for row in found:
+        policies = cells.setdefault((row.reference, row.scenario), {})
+        policies.setdefault(row.policy, {})[row.column] = row
+    for names, policies in cells.items():
+        table.add_row(escape(", ".join(names)), *[""] * (len(columns) + 1), style="bold")
+        for policy, rows in policies.items():
+            of_any = next(iter(rows.values()))
+            figures = (_three(rows[column]) for column in columns)
+            table.add_row(escape(policy), *figures, f"{of_any.failed}/{of_any.episodes}")
+        table.add_section()
     console.print(table)
+
+
+def _three(row: RobotScores) -> str:
+    """Mean, interquartile mean and worst tenth in the unit in which they are shown."""
+    values = (row.column.scale * estimate.value for estimate in (row.mean, row.middle, row.worst))
+    return " / ".join("-" if np.isnan(value) else f"{value:.{row.column.decimals}f}" for value in values)
 
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
