@@ -174,7 +174,7 @@ _FIELDS_OF_RANGES = (
     "tendon_stiffness", "tendon_damping", "tendon_lengthspring", "dof_frictionloss", "dof_damping",
     "body_quat", "body_pos", "body_mass", "body_inertia",
     # which MuJoCo computes from the masses
-    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0", "actuator_acc0",
+    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0",
 )  # fmt: skip
 
 
