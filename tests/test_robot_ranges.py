@@ -51,6 +51,29 @@ def plant_of(env: Any, world: int) -> mujoco.MjModel:
     return model
 
 
+def is_within(ranges: RobotRanges, robot: RobotDraw) -> bool:
+    """Whether a robot lies in ranges; factors on K are taken together."""
+    lowest, highest = np.multiply(ranges.stiffness, ranges.joint_stiffness)
+    found: list[tuple[tuple[float, float], Any]] = [
+        ((lowest, highest), robot.stiffness_factor),
+        (ranges.damping, robot.damping_factor),
+        (ranges.friction, robot.friction_factor),
+        (ranges.backlash_rad, robot.backlash_rad),
+        (ranges.load_kg, robot.load_kg),
+        *zip((ranges.load_x_m, ranges.load_y_m, ranges.load_z_m), robot.load_place_m, strict=True),
+        (ranges.homing_rad, robot.encoder_bias_rad),
+        (ranges.mounting_rad, robot.imu_bias_rad),
+        (ranges.slope_rad, robot.slope_rad),
+    ]
+    is_unpushed = robot.push_n == 0.0 and (ranges.push_share < 1.0 or ranges.push_n[0] == 0.0)
+    if not is_unpushed:
+        found.append((ranges.push_n, robot.push_n))
+    shares = (ranges.delay_share, robot.is_delayed), (ranges.inertial_share, robot.is_inertial)
+    return all(np.all((low <= np.array(v)) & (np.array(v) <= high)) for (low, high), v in found) and all(
+        share > 0.0 if has else share < 1.0 for share, has in shares
+    )
+
+
 @st.composite
 def ranges_of(draw: st.DrawFn) -> RobotRanges:
     """Ranges anywhere within their bounds."""
@@ -74,7 +97,7 @@ def test_robots_lie_in_their_ranges(ranges: RobotRanges, number: int, seed: int)
     robots = draw_robots([ranges], number, 3, [seed])
     assert len(robots) == number
     for robot in robots:
-        assert ranges.contains(robot)
+        assert is_within(ranges, robot)
         assert {len(robot.stiffness_factor), len(robot.encoder_bias_rad)} == {3}
         assert 0.0 <= robot.slope_direction_rad <= 2.0 * math.pi
 
@@ -132,13 +155,13 @@ DAMPING_OF_THE_FIRST = 0.5748213505602238
 
 def test_every_robot_of_drawn_beyond_has_one_quantity_beyond_the_ranges_of_drawn() -> None:
     """Catches a held-out robot that training could have met."""
-    assert all(TRAINING_RANGES.contains(robot) for robot in robot_bank(make_scenario("drawn")))
+    assert all(is_within(TRAINING_RANGES, robot) for robot in robot_bank(make_scenario("drawn")))
     bank = robot_bank(make_scenario("drawn_beyond"))
     assert len(bank) == 256
     shares = np.linspace(0, 256, len(_BEYOND) + 1).round().astype(int)
     for beyond, begin, end in zip(_BEYOND, shares, shares[1:], strict=False):
         for robot in bank[begin:end]:
-            assert TRAINING_RANGES.replace(**beyond).contains(robot)
+            assert is_within(TRAINING_RANGES.replace(**beyond), robot)
         (name, (low, high)), *_ = beyond.items()
         inside = getattr(TRAINING_RANGES, name)
         assert low >= inside[1] or high <= inside[0], name
@@ -281,6 +304,15 @@ def test_an_episode_of_a_drawn_robot_starts_at_rest(ground: str) -> None:
     assert np.abs(truth.q_dot).max() < 1e-3
     for name in ("q", "theta", "pelvis", "ankles"):
         np.testing.assert_allclose(getattr(truth, name), getattr(start, name), rtol=0.0, atol=1e-4, err_msg=name)
+
+
+def test_a_drawn_robot_that_cannot_stand_is_an_error_with_its_values() -> None:
+    """Catches an error that leaves open which of the ranges is too wide."""
+    env = make_walk(**SHORT, scenario=with_ranges(RobotRanges(load_kg=(90.0, 90.0), load_x_m=(0.9, 0.9))))
+    with pytest.raises(
+        ConfigurationError, match=r"load_kg=90\.0 .*load_place_m=\(0\.9, .* does not stand.*narrow the ran"
+    ):
+        env.reset(seed=0)
 
 
 def test_fields_follow_the_robot_from_episode_to_episode() -> None:
@@ -469,4 +501,4 @@ def test_the_table_of_ranges_is_that_of_the_code() -> None:
         drawn = f"{value:g}" if isinstance(value, float) else "{:.4g} to {:.4g}".format(*value)
         assert table.pop(name) == (drawn, "1, where `push_n` is beyond" if name == "push_share" else
                                    "; ".join(beyond.get(name, []))), name  # fmt: skip
-    assert set(table) <= {"input_output", "adaptive_posture", "residual:walker_3s/seed_0"}
+    assert set(table) == {"drawn", "drawn_beyond"}  # of the table of figures

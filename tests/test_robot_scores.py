@@ -23,7 +23,9 @@ from train.evaluate.robots import robot_scores
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
 from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds
+from train.report import Results, write_report
 from train.report.robots_tables import print_robots, robots_table, write_robots
+from train.runs.folders import run_folder
 
 OWN = {"load_kg": [0.0, 2.0]}
 
@@ -115,6 +117,19 @@ def test_file_and_tables_say_what_was_found(tmp_path: Path) -> None:
     text = console.export_text()
     assert "5.00 / 4.00 / 14.00" in text
     assert "[b]other" in text
+
+
+def test_both_reports_have_a_section_of_drawn_robots() -> None:
+    """Catches a table that is computed and not shown, or shown where no robots are drawn."""
+    for scenario, is_shown in (("spread", True), ("nominal", False)):
+        cells = [cell("base", {"all": [4e-3] * 10}, scenario), cell("other", {"all": [2e-3] * 10}, scenario)]
+        with run_folder("x", {}, 0) as folder:
+            robots = robot_scores(cells)
+            files = write_report(Results("x", cells, changes(cells), folder, robots=robots))
+        for file in files:
+            text = file.read_text(encoding="utf-8")
+            assert ("Drawn robots" in text) == is_shown
+            assert ("base: 100 %" in text) == is_shown
 
 
 # Ranges in configurations.

@@ -89,30 +89,6 @@ class RobotRanges(Model):
             if isinstance(value, tuple):
                 yield name, value
 
-    def contains(self, robot: "RobotDraw") -> bool:
-        """Whether a robot lies in the ranges; factors on K are taken together."""
-        K = np.multiply(self.stiffness, self.joint_stiffness)
-        pairs: list[tuple[Interval, Any]] = [
-            ((float(K[0]), float(K[1])), robot.stiffness_factor),
-            (self.damping, robot.damping_factor),
-            (self.friction, robot.friction_factor),
-            (self.backlash_rad, robot.backlash_rad),
-            (self.load_kg, robot.load_kg),
-            *zip((self.load_x_m, self.load_y_m, self.load_z_m), robot.load_place_m, strict=True),
-            (self.homing_rad, robot.encoder_bias_rad),
-            (self.mounting_rad, robot.imu_bias_rad),
-            (self.slope_rad, robot.slope_rad),
-        ]
-        is_pushed = robot.push_n > 0.0
-        pushes = self.push_n[0] <= robot.push_n <= self.push_n[1] if is_pushed else self.push_share < 1.0
-        shares = (self.delay_share, robot.is_delayed), (self.inertial_share, robot.is_inertial)
-        inside = all(np.all((low <= np.array(v)) & (np.array(v) <= high)) for (low, high), v in pairs)
-        return bool(
-            inside
-            and (pushes or self.push_n[0] == 0.0)
-            and all(share > 0.0 if has else share < 1.0 for share, has in shares)
-        )
-
 
 class RobotDraw(Model):
     """A robot as it was drawn: what of it differs from the plant that its scenario describes, and its conditions."""

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.robot_ranges import RobotDraw, RobotRanges, draw_robots
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.elasticity import ElasticJoint
@@ -136,11 +137,20 @@ class PlacedRobot:
 
 @lru_cache(maxsize=_SETTLED)
 def placed_robot(config: WalkConfig, draw: RobotDraw) -> PlacedRobot:
-    """A robot of the bank at rest under zero offset, found once."""
+    """A robot of the bank at rest under zero offset, found once.
+
+    Raises:
+        ElasticError: It does not stand.
+    """
     plan = plan_walk(config.gait, biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
     model = drawn_model(config, draw)
     q = plan.q[0] - np.array(draw.encoder_bias_rad)
-    rest = settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+    try:
+        rest = settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+    except ElasticError as error:
+        if not config.scenario.ranges:
+            raise
+        raise ConfigurationError(f"the drawn robot {draw} cannot walk: {error}; narrow the ranges") from None
     fields = {name: getattr(model, name).copy() for name in drawn_fields(config.scenario)}
     return PlacedRobot({name: values for name, values in fields.items() if values.size}, rest)
 
