@@ -13,6 +13,7 @@ from rich.console import Console
 from scipy import stats
 
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.runtime.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, family, records
 from train.evaluate.changes import HELD_OUT, changes
@@ -157,6 +158,16 @@ def test_a_comparison_plays_its_ranges_and_keeps_those_of_held_out_robots() -> N
     assert beyond.ranges == make_scenario("drawn_beyond").ranges
 
 
+def test_several_ranges_keep_combinations_out_of_training() -> None:
+    """Catches loads on slopes among robots that a list of two ranges draws, and a list that loses one of its parts."""
+    ranges = [{"load_kg": [0.0, 0.0]}, {"slope_rad": [0.0, 0.0]}]
+    config = TrainConfig(env="walker", scenarios=["drawn"], ranges=ranges)
+    bank = robot_bank(make_scenario(config.condition("drawn", "input").scenario_played), 1)
+    assert not [robot for robot in bank if robot.load_kg > 0.0 and robot.slope_rad > 0.0]
+    assert sum(robot.load_kg > 0.0 for robot in bank) == sum(robot.slope_rad > 0.0 for robot in bank) == 128
+    assert TrainConfig(**config.model_dump(mode="json")).ranges == ranges
+
+
 @pytest.mark.parametrize("kind", [TrainConfig, CompareConfig])
 @pytest.mark.parametrize(
     ("given_", "message"),
@@ -164,6 +175,8 @@ def test_a_comparison_plays_its_ranges_and_keeps_those_of_held_out_robots() -> N
         ({"scenarios": ["nominal"], "ranges": OWN}, "ranges need a scenario whose robots are drawn from them"),
         ({"scenarios": ["drawn"], "ranges": {"load": [0, 1]}}, "load"),
         ({"scenarios": ["drawn"], "ranges": {"load_kg": [1, 0]}}, "lowest, highest"),
+        ({"scenarios": ["drawn"], "ranges": [{}, {"load_kg": [1, 0]}]}, "lowest, highest"),
+        ({"scenarios": ["drawn"], "ranges": 3}, "ranges"),
     ],
 )
 def test_ranges_that_do_nothing_are_refused(kind: Any, given_: dict[str, Any], message: str) -> None:

@@ -6,7 +6,7 @@ on `ideal`, and changes can be joined: `soft+payload`.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 from pydantic import Field, model_validator
@@ -16,6 +16,9 @@ from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
+
+MOST_RANGES = 100
+"""Ranges that the robots of a scenario come from."""
 
 
 class Scenario(Model):
@@ -48,7 +51,7 @@ class Scenario(Model):
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
     sensor_noise: float = quantity("1", 0.0, ge=0, description="factor on the errors of further sensors")
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
-    ranges: tuple[RobotRanges, ...] = Field(default=(), max_length=100)
+    ranges: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
     """walker: ranges that every episode's robot is drawn from, in equal shares where there are several; none for the
     robot that the other fields describe. What is drawn comes on top of what they say."""
 
@@ -62,9 +65,17 @@ class Scenario(Model):
             )
         return self
 
-    def with_ranges(self, changes: Mapping[str, Any]) -> Self:
-        """The scenario with other intervals; one that draws from none, or from several ranges, is as it was."""
-        return self.replace(ranges=[self.ranges[0].replace(**changes)]) if len(self.ranges) == 1 else self
+    def with_ranges(self, changes: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Self:
+        """The scenario with other intervals; one that draws from none, or from several ranges, is as it was.
+
+        Args:
+            changes: Fields of `RobotRanges` that differ from the scenario's; of several such mappings each makes ranges
+                of its own, which have equal shares of the robots.
+        """
+        if not changes or len(self.ranges) != 1:
+            return self
+        each = [changes] if isinstance(changes, Mapping) else changes
+        return self.replace(ranges=[self.ranges[0].replace(**own) for own in each])
 
     @property
     def draws_robots(self) -> bool:

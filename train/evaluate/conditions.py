@@ -4,14 +4,14 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.robot_ranges import RobotRanges
-from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.runtime.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
 
 MOST_EPISODES = 100_000
@@ -48,16 +48,20 @@ GivenReference = Annotated[Any, AfterValidator(_reference)]
 """A `Reference`, checked when it is read."""
 
 
-def _ranges(value: dict[str, Any]) -> dict[str, Any]:
-    RobotRanges(**value)
+def _ranges(value: Any) -> Any:
+    for own in value if isinstance(value, list) else [value]:
+        RobotRanges(**own)
     return value
 
 
-GivenRanges = Annotated[dict[str, Any], AfterValidator(_ranges)]
-"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`."""
+GivenRanges = Annotated[
+    dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)], AfterValidator(_ranges)
+]
+"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`; or several such
+mappings, each of an equal share of the robots."""
 
 
-def require_drawn(scenarios: Sequence[str], ranges: Mapping[str, Any]) -> None:
+def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
     """Refuse ranges that no scenario uses.
 
     Raises:

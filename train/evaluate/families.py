@@ -6,7 +6,7 @@ A residual is compared with its base, and with the best policy without learning 
 import difflib
 import fnmatch
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ class Origin:
     missing_seeds: tuple[int, ...]
     folders: tuple[str, ...]
     commits: tuple[str, ...]
-    ranges: Mapping[str, Any] = field(default_factory=dict)
+    ranges: Any = field(default_factory=dict)
 
 
 def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
