@@ -18,7 +18,7 @@ from elastic_env.runtime.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, family, records
 from train.evaluate.changes import HELD_OUT, changes
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import make_vector_env
+from train.evaluate.evaluate import evaluate, make_vector_env
 from train.evaluate.families import Origin
 from train.evaluate.robots import robot_scores
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
@@ -131,6 +131,21 @@ def test_both_reports_have_a_section_of_drawn_robots() -> None:
             text = file.read_text(encoding="utf-8")
             assert ("Drawn robots" in text) == is_shown
             assert ("base: 100 %" in text) == is_shown
+
+
+def test_episodes_say_which_robot_was_drawn() -> None:
+    """Catches the robot of another world or of the next episode, and columns where no robot is drawn from ranges."""
+    walk = {"step_period": [0.3, 0.3, 0.3], "num_steps": 1}
+    condition = Condition(env="walker", policy=PolicySpec(name="input"), scenario="drawn", reference=walk, episodes=3)
+    episodes = evaluate(condition, num_threads=1).episodes
+    env: Any = make_vector_env(condition, 3)
+    env.reset(seed=0)
+    robots = [env.unwrapped.task.robot_record(world) for world in range(3)]
+    assert [{name: episode[name] for name in robots[0]} for episode in episodes] == robots
+    assert len({robot["robot_load_kg"] for robot in robots}) == 3
+    assert robots[0]["robot_stiffness"] == pytest.approx(env.unwrapped.truth().stiffness[0].mean() / 1001.0)
+    nominal: Any = make_vector_env(condition.replace(scenario="nominal"), 1)
+    assert nominal.unwrapped.task.robot_record(0) == {}
 
 
 # Ranges in configurations.

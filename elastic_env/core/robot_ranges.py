@@ -113,6 +113,29 @@ class RobotDraw(Model):
     is_inertial: bool = False
     """Whether the IMU computes its attitude."""
 
+    def record(self) -> dict[str, float]:
+        """The robot in figures, by name with unit, for the records of episodes; of joints mean and rms."""
+        x, y, z = self.load_place_m
+        roll, pitch = self.imu_bias_rad
+        return {
+            "robot_stiffness": float(np.mean(self.stiffness_factor)),
+            "robot_damping": self.damping_factor,
+            "robot_friction": self.friction_factor,
+            "robot_backlash_rad": self.backlash_rad,
+            "robot_load_kg": self.load_kg,
+            "robot_load_x_m": x,
+            "robot_load_y_m": y,
+            "robot_load_z_m": z,
+            "robot_homing_rms_rad": float(np.sqrt(np.mean(np.square(self.encoder_bias_rad)))),
+            "robot_mounting_roll_rad": roll,
+            "robot_mounting_pitch_rad": pitch,
+            "robot_slope_rad": self.slope_rad,
+            "robot_slope_direction_rad": self.slope_direction_rad,
+            "robot_push_n": self.push_n,
+            "robot_is_delayed": float(self.is_delayed),
+            "robot_is_inertial": float(self.is_inertial),
+        }
+
 
 def draw_robots(ranges: Sequence[RobotRanges], number: int, joints: int, seed: Sequence[int]) -> list[RobotDraw]:
     """Robots of ranges, in equal shares where there are several of these; the same in every process.

@@ -349,6 +349,10 @@ class WalkTask(Stateful):
         copies = {name: s[name].copy() for name in names}
         return WalkTruth(**copies, pelvis_R=rotation_of(s["quaternion"]), model=self._true_model)
 
+    def robot_record(self, world: int) -> dict[str, float]:
+        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
+        return self._robot(world).record() if self.config.scenario.ranges else {}
+
     def _row(self, sample: WalkSample) -> IntArray:
         """Rows of the plan's tables."""
         return np.minimum(sample.rows["truth"]["step"], self.num_steps)
