@@ -110,9 +110,7 @@ def require_stable_walker(config: WalkConfig) -> None:
 
     Of ranges the robot with the stiffest springs, and with the strongest dampers.
     """
-    worst = RobotRanges() if not config.scenario.ranges else None
-    for ranges in config.scenario.ranges or (worst,):
-        assert ranges is not None
+    for ranges in config.scenario.ranges or (RobotRanges(),):
         factor = ranges.stiffness[1] * ranges.joint_stiffness[1]
         joints = {
             name: joint.replace(stiffness=joint.stiffness * factor, damping=joint.damping * ranges.damping[1])
