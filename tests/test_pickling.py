@@ -42,6 +42,7 @@ def settled(info: dict[str, Any]) -> dict[str, Any]:
         ("walker", 1, "spread"),
         ("walker", 3, "push"),
         ("walker", 1, "imu"),
+        ("walker", 2, "drawn"),
     ],
 )
 def test_a_copy_in_the_midst_of_an_episode_goes_on_bit_for_bit(

@@ -35,9 +35,9 @@ class Walker(NamedTuple):
     """What does not change within an episode.
 
     Attributes:
-        constants: Addresses, feet, sensors and rules, one row of `CONSTANTS`.
+        constants: Addresses, feet, sensors and rules: rows of `CONSTANTS`, one for every kind of sensors.
         plan: One row per control step.
-        bias: Errors of homing and mounting, (n,).
+        bias: Errors of homing and mounting, and which row of the constants holds, (n,).
     """
 
     constants: Any
@@ -74,13 +74,14 @@ def command(rows: Any, offset: Array, walker: Any, inputs: Array) -> None:
 def begin(physics: Any, walker: Any, noise: Any, worlds: BoolArray, rows: Any) -> None:
     """Truth and measurements at the start of an episode in some worlds, whose encoders have been at rest."""
     physics, walker, noise = Physics(*physics), Walker(*walker), Noise(*noise)
-    constants, feet = walker.constants[0], feet_to_be_filled()
+    feet = feet_to_be_filled()
     for world in range(len(rows)):
         if worlds[world]:
-            truth, shown = rows[world].truth, rows[world].measured
+            truth, shown, bias = rows[world].truth, rows[world].measured, walker.bias[world]
+            constants = walker.constants[bias.fit]
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            drawn, bias = sample_of(noise, world), walker.bias[world]
+            drawn = sample_of(noise, world)
             if constants.quality.inertial.is_fitted:
                 settle_imu(truth, drawn, bias, constants.quality, shown)
             imu_is_due = row_of(walker.plan, truth.step).imu_is_due  # as always at first
@@ -109,9 +110,11 @@ def control_step(
     """
     physics, walker, noise, outcome = Physics(*physics), Walker(*walker), Noise(*noise), Outcome(*outcome)
     offset, diverged = commanded
-    is_over, constants, feet = False, walker.constants[0], feet_to_be_filled()
-    rules = constants.rules
+    is_over, feet = False, feet_to_be_filled()
     for world in range(len(offset)):
+        bias = walker.bias[world]
+        constants = walker.constants[bias.fit]
+        rules = constants.rules
         now[world] = last[world]
         truth, shown, scores = now[world].truth, now[world].measured, now[world].scores
         truth.step += 1
@@ -120,7 +123,7 @@ def control_step(
         if not diverged[world]:
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
-            drawn, bias = sample_of(noise, world), walker.bias[world]
+            drawn = sample_of(noise, world)
             if constants.quality.inertial.is_fitted:
                 advance_imu(last[world].truth, truth, drawn, bias, constants, shown)
             measure(truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
@@ -135,13 +138,14 @@ def control_step(
 
 
 @compiled
-def show(rows: Any, shown: Any, walker: Any, observed: Any) -> None:
-    """Observations of the present state; `shown` are the rows whose measurements are shown."""
+def show(rows: Any, before: Any, walker: Any, observed: Any) -> None:
+    """Observations of the present state; `before` are the rows of the step before."""
     walker = Walker(*walker)
-    period_s = walker.constants[0].rules.control_period_s
     for world in range(len(rows)):
+        rules = walker.constants[walker.bias[world].fit].rules
+        visible = before[world].measured if rules.is_delayed else rows[world].measured
         coming = row_of(walker.plan, rows[world].truth.step + 1)
-        observe(rows[world].truth, shown[world].measured, coming, period_s, observed[world])
+        observe(rows[world].truth, visible, coming, rules.control_period_s, observed[world])
 
 
 @compiled

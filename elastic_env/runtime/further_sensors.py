@@ -159,7 +159,7 @@ class FurtherSensors(Stateful):
         for world in np.flatnonzero(worlds).tolist():
             for name, sensor in self._sensors.items():
                 offset = self._offset[name]
-                width = self._scenario.encoder_bias_rad if sensor.is_encoder else self._scale * sensor.offset
+                width = self._scenario.homing_width_rad if sensor.is_encoder else self._scale * sensor.offset
                 offset[world] = width * draws[world].robot.uniform(-1.0, 1.0, offset.shape[1])
             self._noise.restart(world, draws[world].noise())
         self.measure(worlds, truth)
@@ -176,9 +176,9 @@ class FurtherSensors(Stateful):
         ]
         self._before, self._now = self._now, np.where(worlds[:, None], np.hstack(shown), self._now)
 
-    def columns(self) -> Array:
-        """What they show, as old as the scenario's measurements are, (num_worlds, columns)."""
-        return self._before if self._scenario.delay_steps else self._now
+    def columns(self, is_delayed: BoolArray) -> Array:
+        """What they show, (num_worlds, columns); in worlds whose measurements are old, a control step ago."""
+        return np.where(is_delayed[:, None], self._before, self._now)
 
     @property
     def _scale(self) -> float:

@@ -323,7 +323,7 @@ class JointTask(Stateful):
         if self._observes_imu:
             columns.append(shown.imu)
         if self._sensors:
-            columns.append(self._sensors.columns())
+            columns.append(self._sensors.columns(np.full(self.num_worlds, self.config.scenario.delay_steps > 0)))
         return np.concatenate(columns, axis=1)
 
     def sample(self) -> JointSample:

@@ -6,13 +6,19 @@ on `ideal`, and changes can be joined: `soft+payload`.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
-from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD
+from elastic_env.core.robot_ranges import RobotRanges
+from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
 from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
+
+MOST_RANGES = 100
+"""Ranges that the robots of a scenario come from."""
 
 
 class Scenario(Model):
@@ -45,6 +51,31 @@ class Scenario(Model):
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
     sensor_noise: float = quantity("1", 0.0, ge=0, description="factor on the errors of further sensors")
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
+    ranges: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
+    """walker: ranges that every episode's robot is drawn from, in equal shares where there are several; none for the
+    robot that the other fields describe. What is drawn comes on top of what they say."""
+
+    @model_validator(mode="after")
+    def _ranges_say_all_that_is_drawn(self) -> Self:
+        fixed = [name for name in _LEFT_TO_RANGES if getattr(self, name)]
+        if self.ranges and (fixed or self.pelvis_imu.bias_spread_rad > 0.0):
+            raise ValueError(
+                "ranges say what is drawn; leave out "
+                f"{', '.join(fixed or ['bias_spread_rad of pelvis_imu'])}, or give the ranges an interval for it"
+            )
+        return self
+
+    def with_ranges(self, changes: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Self:
+        """The scenario with other intervals; one that draws from none, or from several ranges, is as it was.
+
+        Args:
+            changes: Fields of `RobotRanges` that differ from the scenario's; of several such mappings each makes ranges
+                of its own, which have equal shares of the robots.
+        """
+        if not changes or len(self.ranges) != 1:
+            return self
+        each = [changes] if isinstance(changes, Mapping) else changes
+        return self.replace(ranges=[self.ranges[0].replace(**own) for own in each])
 
     @property
     def draws_robots(self) -> bool:
@@ -53,13 +84,18 @@ class Scenario(Model):
             self.stiffness_spread, self.push_n, self.slope_rad, self.encoder_bias_rad, self.imu.bias_spread_rad,
             self.pelvis_imu.bias_spread_rad,
         )  # fmt: skip
-        return self.inertial is not None or any(value > 0.0 for value in drawn)
+        return bool(self.ranges) or self.inertial is not None or any(value > 0.0 for value in drawn)
 
     @property
     def is_random(self) -> bool:
         """Whether episodes of the same motion differ: in what `draws_robots` says, or by noise."""
         noise = self.gyro_noise_rad_s, self.force_noise_n, self.moment_noise_nm
         return self.draws_robots or any((*noise, self.imu.is_random, self.pelvis_imu.is_random))
+
+    @property
+    def homing_width_rad(self) -> float:
+        """Half-width of the homing error of encoders beside those of the motors; of ranges their largest error."""
+        return max([self.encoder_bias_rad, *(abs(end) for own in self.ranges for end in own.homing_rad)])
 
     @property
     def pelvis_noise_rad(self) -> float:
@@ -71,6 +107,9 @@ class Scenario(Model):
         """Walker: standard deviation of the gyroscope's noise."""
         return self.gyro_noise_rad_s if self.inertial is None else self.inertial.gyro_noise_rad_s
 
+
+_LEFT_TO_RANGES = "stiffness_spread", "push_n", "slope_rad", "encoder_bias_rad", "inertial", "delay_steps"
+"""Parameters that `RobotRanges` has, too, for each robot its own."""
 
 _IMU = AttitudeSensor(noise_rad=0.2e-3, bias_rad=-1.7e-3)
 # the same sensor in the pelvis, whose offset can be zeroed while the robot hangs; its filter runs at 500 Hz
@@ -118,15 +157,54 @@ CHANGES: dict[str, ScenarioChange] = {
 }
 """Parameters that a change sets on its ground."""
 
+TRAINING_RANGES = RobotRanges(
+    stiffness=(0.75, 1.25),
+    joint_stiffness=(0.8, 1.12),
+    damping=(0.5, 2.0),
+    friction=(0.0, 8.0 / H54_200_S500_R.coulomb_friction),
+    backlash_rad=(0.0, 2e-3),
+    load_kg=(0.0, 8.0),
+    load_x_m=(-0.1, 0.1),
+    load_y_m=(-0.1, 0.1),
+    load_z_m=(-0.15, 0.15),
+    homing_rad=(-_HOMING_ERROR_RAD, _HOMING_ERROR_RAD),
+    mounting_rad=(-_HOMING_ERROR_RAD, _HOMING_ERROR_RAD),
+    slope_rad=(0.0, math.radians(1.5)),
+    push_n=(0.0, 50.0),
+    push_share=0.5,
+    delay_share=0.5,
+)
+"""Ranges of `drawn`: K within ±40 % in all, friction up to 8 N·m. They hold the values of the named changes but
+`stiff`'s on all joints at once."""
+_BEYOND: tuple[dict[str, Any], ...] = (
+    {"stiffness": (0.6, 0.7)},
+    {"stiffness": (1.3, 1.5)},
+    {"friction": (8.0 / H54_200_S500_R.coulomb_friction, 11.0 / H54_200_S500_R.coulomb_friction)},
+    {"backlash_rad": (2e-3, 3e-3)},
+    {"load_kg": (8.0, 11.0)},
+    {"homing_rad": (_HOMING_ERROR_RAD, 1.5 * _HOMING_ERROR_RAD)},
+    {"mounting_rad": (_HOMING_ERROR_RAD, 2.0 * _HOMING_ERROR_RAD)},
+    {"slope_rad": (math.radians(1.5), math.radians(2.5))},
+    {"push_n": (50.0, 80.0), "push_share": 1.0},
+)
+"""What a ninth of the robots of `drawn_beyond` each has beyond the ranges of `drawn`."""
 
-WALKER_FIELDS = ("stiffness_spread", "inertial", "push_n", "slope_rad")
+DISTRIBUTIONS: dict[str, ScenarioChange] = {
+    "drawn": lambda _: {"ranges": [TRAINING_RANGES]},
+    "drawn_beyond": lambda _: {"ranges": [TRAINING_RANGES.replace(**beyond) for beyond in _BEYOND]},
+}
+"""Changes that draw every episode's robot from ranges: those to learn from, and for tests robots that have one
+quantity beyond these."""
+
+
+WALKER_FIELDS = ("stiffness_spread", "inertial", "push_n", "slope_rad", "ranges")
 """Parameters that only a robot that walks knows."""
 WALKER_ONLY = tuple(name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS})
 """Changes that set one of them."""
 
 
 def scenario_names(walks: bool = True) -> list[str]:
-    """Names that `make_scenario` accepts, joined names aside; only those of robots that do not walk if asked."""
+    """Named conditions, joined names and distributions aside; only those of robots that do not walk if asked."""
     return [*GROUNDS, *(name for name in CHANGES if walks or name not in WALKER_ONLY)]
 
 
@@ -149,9 +227,10 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
     for change in changes:
         if change in GROUNDS:
             raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
-        if change not in CHANGES:
-            raise unknown_name("scenario", change, scenario_names(walks))
-        added = CHANGES[change](ground)
+        known = CHANGES | DISTRIBUTIONS
+        if change not in known:
+            raise unknown_name("scenario", change, [*scenario_names(walks), *(DISTRIBUTIONS if walks else ())])
+        added = known[change](ground)
         twice = sorted(parameters.keys() & added.keys())
         if twice:
             raise ConfigurationError(f"scenario {name!r}: {change!r} sets {', '.join(twice)} a second time")

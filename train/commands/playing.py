@@ -75,7 +75,7 @@ class Evaluate:
     or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, payload, backlash,
-    sensor, ideal+soft; on the walker also spread, imu, push, slope."""
+    sensor, ideal+soft; on the walker also spread, imu, push, slope, drawn, drawn_beyond."""
     reference: str | None = None
     """Motion. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some seconds),
     or a mapping such as '{kind: sine, amplitude: 0.3}'.

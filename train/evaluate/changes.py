@@ -202,22 +202,31 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
         groups: Scenarios to pool over, by name.
     """
     trained = families(evaluations)
-    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
     members = {e.condition.policy.title: e.condition.member for e in evaluations if e.condition.member}
-    default = list(dict.fromkeys(member.base for member in members.values())) or titles[:1]
     rows = []
-    for title in titles:
+    for title, others in opponents(evaluations).items():
         own = [e for e in evaluations if e.condition.policy.title == title]
         member = members.get(title)
-        opponents = [base for base in default if base != title] if member is None else [member.base]
-        if member is not None and member.rival is not None:
-            opponents.append(member.rival)
-        for base in opponents:
+        for base in others:
             theirs = [e for e in evaluations if e.condition.policy.title == base]
             found = _against(own, theirs, trained.get(title), groups or {})
             is_rival = member is not None and base == member.rival
             rows += [replace(row, is_rival=True) for row in found] if is_rival else found
     return rows
+
+
+def opponents(evaluations: Sequence[Evaluation]) -> dict[str, list[str]]:
+    """Titles of those whom each policy is compared with: base and rival, or of a baseline the bases, or the first."""
+    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
+    members = {e.condition.policy.title: e.condition.member for e in evaluations if e.condition.member}
+    default = list(dict.fromkeys(member.base for member in members.values())) or titles[:1]
+    found = {}
+    for title in titles:
+        member = members.get(title)
+        found[title] = [base for base in default if base != title] if member is None else [member.base]
+        if member is not None and member.rival is not None:
+            found[title].append(member.rival)
+    return found
 
 
 def level(members: Sequence[Evaluation], column: Column) -> Estimate:
@@ -335,12 +344,17 @@ def _marks(
 
 def _seen_as(condition: Condition, trained: Origin | None) -> str:
     """The scenario of a condition; one whose fields are varied by the name under which training has seen the same."""
-    played = condition.scenario_played
-    if isinstance(played, str):
+    played, ranges = condition.scenario_played, {} if trained is None else trained.ranges
+    if isinstance(played, str) and not ranges:
         return played
     seen = trained.scenarios if trained is not None and trained.scenarios is not None else ()
-    same = (name for name in seen if make_scenario(name).replace(name="") == played.replace(name=""))
-    return next(same, f"varied {condition.scenario}")
+    played = make_scenario(played)
+    same = (
+        name for name in seen if make_scenario(name).with_ranges(ranges).replace(name="") == played.replace(name="")
+    )
+    if condition.swept:
+        return next(same, f"varied {condition.scenario}")
+    return next(same, f"{condition.scenario} of other ranges" if condition.scenario in seen else condition.scenario)
 
 
 def _motion(known: Environment, reference: Any) -> str:

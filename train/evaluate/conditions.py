@@ -1,16 +1,17 @@
 """Cells of a comparison: which policy plays which motion in which environment, as configurations say it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
-from elastic_env.core.errors import shown
-from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.robot_ranges import RobotRanges
+from elastic_env.runtime.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
 
 MOST_EPISODES = 100_000
@@ -45,6 +46,31 @@ def _refuse(taken: set[str], what: str) -> None:
 
 GivenReference = Annotated[Any, AfterValidator(_reference)]
 """A `Reference`, checked when it is read."""
+
+
+def _ranges(value: Any) -> Any:
+    for own in value if isinstance(value, list) else [value]:
+        RobotRanges(**own)
+    return value
+
+
+GivenRanges = Annotated[
+    dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)], AfterValidator(_ranges)
+]
+"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`; or several such
+mappings, each of an equal share of the robots."""
+
+
+def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
+    """Refuse ranges that no scenario uses.
+
+    Raises:
+        ConfigurationError: There are ranges, and no scenario draws robots from one set of them.
+    """
+    if ranges and not any(len(make_scenario(scenario).ranges) == 1 for scenario in scenarios):
+        raise ConfigurationError(
+            f"ranges need a scenario whose robots are drawn from them, such as 'drawn', got {shown(list(scenarios))}"
+        )
 
 
 class PolicySpec(Model):
@@ -99,6 +125,8 @@ class Condition(Model):
     scenario: Title = "nominal"
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
+    ranges: GivenRanges = {}
+    """Intervals in place of those of the scenario, where it draws robots from ranges."""
     swept: dict[str, float] = {}
     """What is varied, and its value here: an option of the policy, or with `SCENARIO` before it one of the scenario."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
@@ -136,9 +164,11 @@ class Condition(Model):
 
     @property
     def scenario_played(self) -> str | Scenario:
-        """The scenario with the fields that are varied; its name where none is."""
+        """The scenario with ranges of its own and the fields that are varied; its name where it has neither."""
         fields = {name: value for name, value in self.swept.items() if name.startswith(SCENARIO)}
-        return varied(make_scenario(self.scenario), fields) if fields else self.scenario
+        if not fields and not self.ranges:
+            return self.scenario
+        return varied(make_scenario(self.scenario).with_ranges(self.ranges), fields)
 
     @property
     def policy_options(self) -> dict[str, Any]:

@@ -195,6 +195,7 @@ def _play_in(
     is_scored = hasattr(policy, "link_estimate") and not condition.environment.is_real
     estimates = _Estimates(task, worlds) if is_scored else None
     imu = _ImuError(task, worlds) if isinstance(task.assumed_model, WalkerModel) else None
+    robots = _Robots(task) if hasattr(task, "robot_record") else None
     observation, info = env.reset(seed=condition.seed + first)
     records: list[dict[str, Any] | None] = [None] * worlds
     state, episode_start, step, reported = None, np.ones(worlds, dtype=np.bool_), 0, 0
@@ -211,7 +212,7 @@ def _play_in(
         episode_start = np.zeros(worlds, dtype=np.bool_)
         for world in np.flatnonzero(terminated | truncated):
             if records[world] is None:
-                own = [part.metrics(int(world)) for part in (estimates, imu) if part is not None]
+                own = [part.metrics(int(world)) for part in (estimates, imu, robots) if part is not None]
                 records[world] = _record(condition, first + int(world), info, int(world), own)
                 if world == 0 and keeper is not None:
                     keeper.take(observation, info)
@@ -302,6 +303,18 @@ class _ImuError:
     def metrics(self, world: int) -> dict[str, float]:
         """RMS of the angle by which the shown vertical is off."""
         return {"imu_error_rms_rad": self._rms.of(world)}
+
+
+class _Robots:
+    """The robots that a walker draws from ranges."""
+
+    def __init__(self, task: Any) -> None:
+        self._task = task
+
+    def metrics(self, world: int) -> dict[str, float]:
+        """What was drawn, in figures."""
+        found: dict[str, float] = self._task.robot_record(world)
+        return found
 
 
 class _Estimates:

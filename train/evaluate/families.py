@@ -7,8 +7,9 @@ import difflib
 import fnmatch
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
@@ -47,6 +48,7 @@ class Origin:
         missing_seeds: Training seeds of its configuration that the family does not have.
         folders: Its folders.
         commits: Commits that trained it.
+        ranges: Intervals of drawn robots that its configuration names.
     """
 
     scenarios: tuple[str, ...] | None
@@ -55,6 +57,7 @@ class Origin:
     missing_seeds: tuple[int, ...]
     folders: tuple[str, ...]
     commits: tuple[str, ...]
+    ranges: Any = field(default_factory=dict)
 
 
 def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entrant]:
@@ -117,6 +120,7 @@ def origin(members: Sequence[Member]) -> Origin:
         missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
         folders=tuple(member.folder for member in members),
         commits=tuple(dict.fromkeys(d.origin.commit or "unknown" for d in descriptions)),
+        ranges=descriptions[0].training.get("config", {}).get("ranges") or {},
     )
 
 

@@ -12,18 +12,20 @@ from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, qu
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from train.evaluate.cells import CellsFailedError, run_conditions
 from train.evaluate.changes import changes, merged
-from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, PolicySpec
+from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import Environment, Reference, environment
 from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
 from train.evaluate.families import expand
 from train.evaluate.leaderboard import standings
 from train.evaluate.maps import MapConfig, heat_maps
+from train.evaluate.robots import robot_scores
 from train.experiments.timing import step_times
 from train.figures import plots
 from train.figures.figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.changes_tables import print_changes, write_maps, write_statistics
 from train.report.leaderboard import write_leaderboard
+from train.report.robots_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
@@ -59,6 +61,8 @@ class CompareConfig(Model):
     scenario_episodes: dict[str, int] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode")
+    ranges: GivenRanges = {}
+    """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as stiffness."""
     figure_policies: list[str] = []
@@ -104,6 +108,7 @@ class CompareConfig(Model):
         self._require_map()
         _require_each_once("reference", self._reference_names())
         _require_each_once("scenario", self.scenarios)
+        require_drawn(self.scenarios, self.ranges)
         _require_each_once("value of the sweep", self.sweep.values if self.sweep else [])
         for title in self.figure_policies:
             if title not in titles:
@@ -176,7 +181,7 @@ class CompareConfig(Model):
         return [
             Condition(
                 env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
-                scenario=scenario, swept=swept,
+                scenario=scenario, swept=swept, ranges=self.ranges,
                 env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
@@ -254,6 +259,9 @@ def compare(
                 console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
             raise
         files = [write_episodes(evaluations, folder / "episodes.csv")]
+        robots = robot_scores(evaluations)
+        if robots:
+            files.append(write_robots(robots, folder / "robots.csv"))
         cells = merged(evaluations)
         files.append(write_summary(cells, folder / "summary.md"))
         axis = None if config.sweep is None else config.sweep.label or config.sweep.option
@@ -269,8 +277,9 @@ def compare(
             files += write_leaderboard(board, folder)
         if report:
             files.append(write_statistics(rows, folder / "statistics.csv"))
-            files += write_report(Results(config.name, evaluations, rows, folder, axis, maps, board))
+            files += write_report(Results(config.name, evaluations, rows, folder, axis, maps, board, robots))
     print_summary(cells, console)
+    print_robots(robots, console)
     print_changes(rows, console)
     return Comparison(folder, evaluations, files)
 

@@ -12,7 +12,7 @@ from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.config import MOST_ENTRIES, Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.registration import require_memory
-from train.evaluate.conditions import MOST_EPISODES, Condition, GivenReference, PolicySpec
+from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import environment
 from train.learn.mixed_env import mixed_env
 from train.runs.kinds import is_a
@@ -39,6 +39,8 @@ class TrainConfig(Model):
     """Scenarios whose worlds are learned from together, in equal shares."""
     weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = {}
     """How much the rewards of single scenarios count; 1 where nothing is said."""
+    ranges: GivenRanges = {}
+    """Intervals that the robots of `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}
     """Further arguments of the environment, such as the weights of its reward."""
     base: Title = "input_output"
@@ -76,6 +78,11 @@ class TrainConfig(Model):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _ranges_are_of_a_scenario(self) -> Self:
+        require_drawn(self.scenarios, self.ranges)
+        return self
+
     @field_validator("algorithm_options")
     @classmethod
     def _policy_arguments_are_a_mapping(cls, options: dict[str, Any]) -> dict[str, Any]:
@@ -103,6 +110,7 @@ class TrainConfig(Model):
             policy=PolicySpec(name=policy, options=self.base_options if policy == self.base else {}),
             scenario=scenario,
             reference=self.motion,
+            ranges=self.ranges,
             env_options=self.env_options,
             episodes=1 if is_one else self.evaluation_episodes,
             seed=EVALUATION_SEED,

@@ -8,6 +8,7 @@ from train.evaluate.changes import BEST_ANALYTIC, Change, by_line, percent_inter
 from train.figures.map_plots import in_rows, panels
 from train.report.changes_tables import falls
 from train.report.leaderboard import leaderboard_markdown
+from train.report.robots_tables import ROBOTS, WORDS, robots_table
 from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
 from train.runs.escaping import markdown_table, markdown_text
 
@@ -34,6 +35,9 @@ def markdown(results: Results) -> str:
     ):
         if rows:
             parts += [f"## {title}", _changes_markdown(rows, results.swept_options)]
+    if results.robots:
+        head, rows = robots_table(results.robots)
+        parts += ["## Drawn robots", ROBOTS, _markdown_table(head, rows, words=WORDS, last_is_words=True)]
     for title, columns in results.lines.environment.splits:
         head, rows = scores(results, columns)
         parts += [f"## {title}", SCORES, _markdown_table(head, rows, words=3 + len(results.swept_options))]

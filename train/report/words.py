@@ -28,6 +28,7 @@ from train.evaluate.families import Origin
 from train.evaluate.leaderboard import Standing
 from train.evaluate.maps import HeatMap
 from train.evaluate.progress import Curves, learning_curves
+from train.evaluate.robots import RobotScores
 from train.report.parts import Lines, number_interval
 
 SCORES = (
@@ -49,6 +50,7 @@ class Results:
         swept: What the axis of a sweep says; None without one.
         maps: Heat maps over two axes, where such are wanted.
         standings: Rows of the leaderboard, where one is wanted.
+        robots: Scores over the robots of the cells that draw them.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Results:
     swept: str | None = None
     maps: Sequence[HeatMap] = ()
     standings: Sequence[Standing] = ()
+    robots: Sequence[RobotScores] = ()
 
     @cached_property
     def families(self) -> dict[str, Origin]:

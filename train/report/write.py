@@ -13,6 +13,7 @@ from train.report.curves import learning, over_time, sweep
 from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
+from train.report.robots_tables import ROBOTS, WORDS, robots_table
 from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
 
 _LONG = 40
@@ -51,6 +52,7 @@ def _page(results: Results) -> Page:
     if results.has_conditions:
         _add_ladder(page, results)
     _add_changes(page, results)
+    _add_robots(page, results)
     _add_phases(page, results)
     if results.has_conditions:
         _add_curves(page, results)
@@ -148,6 +150,15 @@ def _add_changes(page: Page, results: Results) -> None:
             "Paired differences of means. Baselines are not trained: there are no training seeds to draw from.",
         )
         page.add("changes", {"lines": by_line(others), **more}, _if_long("Table of differences", others))
+
+
+def _add_robots(page: Page, results: Results) -> None:
+    """Scores over drawn robots: the middle half, the worst tenth, and how many robots are better off."""
+    if not results.robots:
+        return
+    page.section("Drawn robots", ROBOTS)
+    head, rows = robots_table(results.robots)
+    page.add("table", {"head": head, "rows": rows, "words": WORDS}, _if_long("Table of drawn robots", rows))
 
 
 def _if_long(title: str, rows: Sequence[object]) -> str | None:

@@ -1,21 +1,25 @@
 """Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
 
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 from pydantic import Field
 
 from elastic_env.core.config import Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.robot_ranges import RobotDraw, RobotRanges, draw_robots
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import spring_name
-from elastic_env.joint.make_elastic import Form
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
-from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, biped, elastic_spec
+from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, add_load, biped, elastic_spec, place_load
 from elastic_env.robots.thormang.standing import Equilibrium, settle
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.scenario import Scenario, make_scenario
@@ -85,45 +89,106 @@ class WalkConfig(Model):
         return self.robot.replace(torso_load_kg=self.robot.torso_load_kg + self.scenario.torso_load_kg)
 
     def true_model(self) -> mujoco.MjModel:
-        """The plant, a spread of stiffness and the direction of a slope aside."""
+        """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
         spec = elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
+        if self.scenario.ranges:
+            add_load(spec, 0.0, np.zeros(3))
         if ACCELEROMETER in self.sensors:
             add_accelerometer(spec, "imu")
         return spec.compile()
 
 
-class RobotDraw(Model):
-    """What of a robot is drawn: a scenario with a random robot has a bank of these, an episode takes one of them."""
-
-    stiffness_factor: tuple[float, ...] = (1.0,) * len(LEG_JOINTS)
-    encoder_bias_rad: tuple[float, ...] = (0.0,) * len(LEG_JOINTS)
-    slope_direction_rad: float = 0.0
-
-
-BANK_SIZE = 64
-"""Robots in the bank of a scenario that draws them."""
+BANK_SIZE, RANGES_BANK_SIZE = 64, 256
+"""Robots in the bank of a scenario that draws them: of a named one, and of one with ranges."""
+_SETTLED = 4096
+"""Robots that are kept with their state at rest, of 10 kB each at most."""
 
 
 @lru_cache(maxsize=64)
-def require_stable_walker(
-    robot: Thormang, joints: tuple[ElasticJoint, ...], form: Form, timestep_s: float, control_period_s: float
-) -> None:
-    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked at once."""
-    spec = elastic_spec(robot, dict(zip(LEG_JOINTS, joints, strict=True)), form, timestep_s)
-    require_stable(spec.compile(), control_period_s)
+def require_stable_walker(config: WalkConfig) -> None:
+    """Refuse joints that explode with the physics step, see `elastic_env.joint.time_step`; looked at once.
+
+    Of ranges the robot with the stiffest springs, and with the strongest dampers.
+    """
+    for ranges in config.scenario.ranges or (RobotRanges(),):
+        factor = ranges.stiffness[1] * ranges.joint_stiffness[1]
+        joints = {
+            name: joint.replace(stiffness=joint.stiffness * factor, damping=joint.damping * ranges.damping[1])
+            for name, joint in config.true_joints.items()
+        }
+        spec = elastic_spec(config.true_robot, joints, config.form, config.timestep_s)
+        require_stable(spec.compile(), config.control_period_s)
 
 
-@lru_cache(maxsize=512)
-def equilibrium(config: WalkConfig, draw: RobotDraw) -> Equilibrium:
-    """Where a robot of the bank stands under zero offset, found once."""
+@dataclass(frozen=True)
+class PlacedRobot:
+    """A robot of the bank at rest.
+
+    Attributes:
+        fields: Of `MjModel`, by name, in which robots of the bank differ.
+        rest: Where it stands under zero offset.
+    """
+
+    fields: Mapping[str, Array]
+    rest: Equilibrium
+
+
+@lru_cache(maxsize=_SETTLED)
+def placed_robot(config: WalkConfig, draw: RobotDraw) -> PlacedRobot:
+    """A robot of the bank at rest under zero offset, found once.
+
+    Raises:
+        ElasticError: It does not stand.
+    """
     plan = plan_walk(config.gait, biped(config.robot), config.control_period_s)  # pyright: ignore[reportArgumentType]
-    model = config.true_model()
+    model = drawn_model(config, draw)
+    q = plan.q[0] - np.array(draw.encoder_bias_rad)
+    try:
+        rest = settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+    except ElasticError as error:
+        if not config.scenario.ranges:
+            raise
+        raise ConfigurationError(f"the drawn robot {draw} cannot walk: {error}; narrow the ranges") from None
+    fields = {name: getattr(model, name).copy() for name in drawn_fields(config.scenario)}
+    return PlacedRobot({name: values for name, values in fields.items() if values.size}, rest)
+
+
+def drawn_model(config: WalkConfig, draw: RobotDraw) -> mujoco.MjModel:
+    """The plant of a robot of the bank."""
+    model = copy.copy(_undrawn_model(config))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     if config.form == "tendon":
         springs = spring_ids(model)
         model.tendon_stiffness[springs] *= np.array(draw.stiffness_factor)
-    model.body("floor").quat[:] = floor_tilt(config.scenario.slope_rad, draw.slope_direction_rad)
-    q = plan.q[0] - np.array(draw.encoder_bias_rad)
-    return settle(model, LEG_JOINTS, plan.pelvis[0], q, q)
+        model.tendon_damping[springs] *= draw.damping_factor
+        model.tendon_lengthspring[springs] += draw.backlash_rad * np.array([-0.5, 0.5])
+    links = [model.joint(name).dofadr[0] for name in LEG_JOINTS]
+    model.dof_frictionloss[links] *= draw.friction_factor
+    model.dof_damping[links] *= draw.friction_factor
+    model.body("floor").quat[:] = floor_tilt(draw.slope_rad, draw.slope_direction_rad)
+    if config.scenario.ranges:
+        place_load(model, draw.load_kg, np.array(draw.load_place_m))
+    return model
+
+
+def drawn_fields(scenario: Scenario) -> tuple[str, ...]:
+    """Fields of `MjModel` in which the robots of a scenario's bank differ."""
+    if scenario.ranges:
+        return _FIELDS_OF_RANGES
+    spread = ("tendon_stiffness",) if scenario.stiffness_spread > 0.0 else ()
+    return (*spread, "body_quat") if scenario.slope_rad > 0.0 else spread
+
+
+_FIELDS_OF_RANGES = (
+    "tendon_stiffness", "tendon_damping", "tendon_lengthspring", "dof_frictionloss", "dof_damping",
+    "body_quat", "body_pos", "body_mass", "body_inertia",
+    # which MuJoCo computes from the masses
+    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0",
+)  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _undrawn_model(config: WalkConfig) -> mujoco.MjModel:
+    return config.true_model()
 
 
 def spring_ids(model: mujoco.MjModel) -> IntArray:
@@ -139,14 +204,22 @@ def floor_tilt(angle: float, direction: float) -> Array:
 
 def robot_bank(scenario: Scenario, number: int = 0) -> list[RobotDraw]:
     """The robots of a scenario: one, or a bank, the same in every process; banks of other numbers have other robots."""
+    n = len(LEG_JOINTS)
+    if scenario.ranges:
+        return draw_robots(scenario.ranges, RANGES_BANK_SIZE, n, (_BANK_SEED, number))
+    conditions: dict[str, Any] = {
+        "push_n": scenario.push_n, "slope_rad": scenario.slope_rad,
+        "is_delayed": scenario.delay_steps > 0, "is_inertial": scenario.inertial is not None,
+    }  # fmt: skip
     if scenario.stiffness_spread == scenario.encoder_bias_rad == scenario.slope_rad == 0.0:
-        return [RobotDraw()]
-    generator, n = np.random.default_rng(_BANK_SEED + number), len(LEG_JOINTS)
+        return [RobotDraw(stiffness_factor=(1.0,) * n, encoder_bias_rad=(0.0,) * n, **conditions)]
+    generator = np.random.default_rng(_BANK_SEED + number)
     return [
         RobotDraw(
             stiffness_factor=tuple((1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)).tolist()),
             encoder_bias_rad=tuple((scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)).tolist()),
             slope_direction_rad=float(generator.uniform(0.0, 2.0 * np.pi)),
+            **conditions,
         )
         for _ in range(BANK_SIZE)
     ]

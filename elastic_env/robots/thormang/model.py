@@ -41,6 +41,7 @@ SOLE_HALF_SIZE_M = (0.13, 0.08)
 
 _SOLE_HALF_THICKNESS = 0.01
 _LOAD_GYRATION_M = 0.1
+_TORSO = "upper_body"
 _TWIN_KNEE = {"stiffness": 2.0, "rotor_inertia": 2.0, "damping": 2.0, "coulomb_friction": 2.0}
 
 
@@ -117,7 +118,7 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
             body.add_joint(name=link.joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=link.axis, range=link.limits,
                            limited=mujoco.mjtLimited.mjLIMITED_TRUE)  # fmt: skip
     if robot.torso_load_kg > 0.0:
-        torso, load = bodies["upper_body"], robot.torso_load_kg
+        torso, load = bodies[_TORSO], robot.torso_load_kg
         inertia = [load * _LOAD_GYRATION_M**2] * 3
         torso.add_body(name="load", pos=torso.ipos, mass=load, inertia=inertia, explicitinertial=True)
     for side in SIDES:
@@ -145,6 +146,31 @@ def elastic_spec(
         for kind, name in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):
             spec.add_sensor(name=f"{side}_{name}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{side}_ft")
     return spec
+
+
+DRAWN_LOAD = "drawn_load"
+"""Body of the load that a scenario draws."""
+
+
+def add_load(spec: mujoco.MjSpec, mass: float, place: Array) -> None:
+    """Fix a `DRAWN_LOAD` to the upper body.
+
+    Args:
+        spec: The robot.
+        mass: Of the load [kg].
+        place: From the center of mass of the upper body, (3,) [m].
+    """
+    torso = spec.body(_TORSO)
+    load = torso.add_body(name=DRAWN_LOAD, pos=torso.ipos + place, mass=mass, explicitinertial=True)
+    load.ipos, load.inertia = np.zeros(3), np.full(3, mass * _LOAD_GYRATION_M**2)
+
+
+def place_load(model: mujoco.MjModel, mass: float, place: Array) -> None:
+    """Change mass and place of the `DRAWN_LOAD` in a compiled model, as `add_load` has them."""
+    load = model.body(DRAWN_LOAD)
+    load.mass[:], load.inertia[:] = mass, mass * _LOAD_GYRATION_M**2
+    load.pos[:] = model.body(_TORSO).ipos + place
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _add_sole(foot: mujoco.MjsBody, side: str, friction: float) -> None:

@@ -36,6 +36,7 @@ TRUTH = record_type(
     ("q", REAL, NUM_JOINTS), ("q_dot", REAL, NUM_JOINTS),  # link side [rad], [rad/s]
     ("servo_torque", REAL, NUM_JOINTS),  # [N·m]
     ("stiffness", REAL, NUM_JOINTS),  # true K [N·m/rad]
+    ("damping", REAL, NUM_JOINTS), ("backlash", REAL, NUM_JOINTS),  # true D [N·m·s/rad], dead band [rad]
     ("offset", REAL, NUM_JOINTS), ("command", REAL, NUM_JOINTS),  # a, and θ_cmd = q_ref + a [rad]
     ("command_rate", REAL),  # rms over the joints of the change of a [rad/s]
     ("pelvis", REAL, 3), ("quaternion", REAL, 4),  # position [m], orientation w, x, y, z
@@ -65,8 +66,9 @@ NOISE = record_type(*((group.name, REAL, group.shape) for group in GROUPS if gro
 BIAS = record_type(
     ("encoder", REAL, NUM_JOINTS), ("imu_attitude", REAL, 2),  # of homing and mounting [rad]
     ("gyro", REAL, 3), ("specific_force", REAL, 3),  # within an inertial IMU [rad/s], [m/s²]
+    ("fit", WHOLE),  # row of CONSTANTS that has the sensors which are fitted
 )  # fmt: skip
-"""Errors that are drawn per episode."""
+"""Errors that are drawn per episode, and the sensors that have them."""
 
 SCORES = record_type(("tilt", REAL), ("zmp", REAL), ("effort", REAL), ("smoothness", REAL), ("fall", REAL))
 """Weighted terms of the reward."""
@@ -152,7 +154,7 @@ class WalkTruth:
         pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
         stiffness: True K, (num_worlds, 12) [N·m/rad].
-        model: The true joints and masses, a spread of stiffness aside.
+        model: The true joints and masses, what is drawn aside.
     """
 
     theta: Array

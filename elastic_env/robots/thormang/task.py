@@ -61,6 +61,7 @@ import numpy as np
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.draws import Draws
+from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
 from elastic_env.core.state import Stateful
 from elastic_env.dynamics import walk_kernels as kernels
@@ -74,11 +75,9 @@ from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
     WalkConfig,
-    equilibrium,
-    floor_tilt,
+    placed_robot,
     require_stable_walker,
     robot_bank,
-    spring_ids,
 )
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, biped
 from elastic_env.robots.thormang.rows import (
@@ -104,7 +103,7 @@ from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import NoiseStream, angle_of_count, is_due
+from elastic_env.runtime.sensors import InertialSensor, NoiseStream, angle_of_count, is_due
 from elastic_env.runtime.task import Outcome
 
 FELL_ROW, NUM_ENDS = 1, 4
@@ -118,7 +117,7 @@ class WalkTask(Stateful):
     """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.runtime.task.Task`."""
 
     STATE = (
-        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_sensors", "_rows", "_shown", "_offset",
+        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_sensors", "_rows", "_rows_before", "_offset",
         "_has_fallen",
     )  # fmt: skip
 
@@ -142,16 +141,10 @@ class WalkTask(Stateful):
         )
         require_feasible(self.plan, robot, model.servos)
         self._true_model = _true_model(config, self.plan, table)
-        require_stable_walker(
-            config.true_robot,  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-            tuple(config.true_joints.values()),  # pyright: ignore[reportArgumentType]
-            config.form,
-            config.timestep_s,
-            config.control_period_s,
-        )
+        require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.model = config.true_model()
         self._bank = robot_bank(config.scenario, config.bank)
-        self._springs = spring_ids(self.model) if config.form == "tendon" else None
+        self._fits = list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self._bank))
         feet = [self.model.body(f"{side}_foot").id for side in SIDES]
         sensors = FootSensors(self.model.body_mass[feet], self.model.body_ipos[feet], self.model.opt.gravity.copy())
         sites = np.array([self.model.site(f"{side}_ft").id for side in SIDES])
@@ -167,18 +160,22 @@ class WalkTask(Stateful):
         at = one(
             ADDRESSES, theta=joints.theta, q=joints.q, theta_dot=joints.theta_dot, q_dot=joints.q_dot, ankles=sites
         )
-        self._constants = one(
-            CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
-            quality=_quality(config.scenario, self._true_model.encoder_counts_per_turn, robot.gravity),
-            rules=_rules(config, UNLOADED_SHARE * weight, least_n),
-        )  # fmt: skip
+        counts = self._true_model.encoder_counts_per_turn
+        rules = _rules(config, UNLOADED_SHARE * weight, least_n)
+        self._constants = np.concatenate([
+            one(
+                CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
+                quality=_quality(_fitted(config.scenario, is_inertial), counts, robot.gravity),
+                rules=_delayed(rules, is_delayed),
+            )
+            for is_delayed, is_inertial in self._fits
+        ])  # fmt: skip
         self._plan_rows = _plan_rows(self.plan, config)
         self._draw = np.zeros(n, dtype=np.int64)
-        self._damping = self._true_model.damping
-        self._backlash = self._true_model.backlash if self._true_model.backlash.any() else 0.0
+        self._pushes = any(robot.push_n > 0.0 for robot in self._bank)
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
         self._noise = NoiseStream(n, NOISE)
-        self._rows = self._shown = np.zeros(n, STEP)
+        self._rows = self._rows_before = np.zeros(n, STEP)
         self._rows_ahead, self._rows_left = np.zeros((0, n), STEP), 0
         self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
         self._phases.flags.writeable = False
@@ -199,10 +196,11 @@ class WalkTask(Stateful):
         for world in np.flatnonzero(worlds).tolist():
             generator = draws[world].robot
             self._draw[world] = generator.integers(len(self._bank))
-            self._bias["imu_attitude"][world] = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+            mounting = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+            self._bias["imu_attitude"][world] = mounting + np.array(self._robot(world).imu_bias_rad)
             self._draw_push(world, draws[world])
             self._noise.restart(world, draws[world].noise())
-            truth["stiffness"][world] = self._place(simulation, world)
+            self._place(simulation, world, truth)
             self._draw_imu(world, generator)
         simulation.refresh(worlds)
         if not self._is_compiled:
@@ -210,7 +208,7 @@ class WalkTask(Stateful):
             self._is_compiled = True
         kernels.begin(self._physics(simulation), self._walker, self._noise.ready(), worlds, rows)
         self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
-        self._shown = np.where(worlds, rows, self._shown)
+        self._rows_before = np.where(worlds, rows, self._rows_before)
         if self._sensors:
             self._sensors.restart(worlds, draws, self._felt(simulation))
 
@@ -233,7 +231,7 @@ class WalkTask(Stateful):
 
     def disturb(self, simulation: Simulation) -> None:
         """Push the torso where and when the scenario says."""
-        if self.config.scenario.push_n > 0.0:
+        if self._pushes:
             steps = round(self.config.scenario.push_s / self.config.control_period_s)
             since = self._rows["truth"]["step"] - self._push_begin
             active = (since >= 0) & (since < steps)
@@ -248,7 +246,7 @@ class WalkTask(Stateful):
             self._physics(simulation), self._walker, self._noise.ready(), (self._offset, diverged), last, rows,
             (observed, reward, ends),
         )  # fmt: skip
-        self._rows, self._shown = rows, last if self.config.scenario.delay_steps > 0 else rows
+        self._rows, self._rows_before = rows, last
         self._has_fallen = ends[FELL_ROW]
         if self._sensors:
             self._sensors.measure(~diverged, self._felt(simulation))
@@ -265,18 +263,21 @@ class WalkTask(Stateful):
     def observe(self) -> Array:
         """See the table of the module."""
         columns, observed = _observed(self.num_worlds)
-        kernels.show(self._rows, self._shown, self._walker, observed)
+        kernels.show(self._rows, self._rows_before, self._walker, observed)
         return self._observation(columns)
 
     def _observation(self, columns: Array) -> Array:
         """The standard columns of an observation and what further sensors show."""
-        return np.hstack([columns, self._sensors.columns()]) if self._sensors else columns
+        if not self._sensors:
+            return columns
+        is_delayed = self._constants["rules"]["is_delayed"][self._bias["fit"]]
+        return np.hstack([columns, self._sensors.columns(is_delayed)])
 
     def _felt(self, simulation: Simulation) -> Felt:
         """What further sensors feel; the specific force lags one physics step behind."""
         truth = self._rows["truth"]
         deflection, rate = truth["theta"] - truth["q"], truth["theta_dot"] - truth["q_dot"]
-        torque = joint_torque(deflection, rate, truth["stiffness"], self._damping, self._backlash)
+        torque = joint_torque(deflection, rate, truth["stiffness"], truth["damping"], truth["backlash"])
         has_force = ACCELEROMETER in self.config.sensors
         force = specific_force(self.model, simulation.bind("sensordata")) if has_force else np.zeros((len(truth), 3))
         return Felt(truth["q"].copy(), torque, force)
@@ -290,7 +291,7 @@ class WalkTask(Stateful):
         truth, row, plan, timing = sample.rows["truth"], self._row(sample), self.plan, self.plan.timing
         error, deflection = plan.q[row] - truth["q"], truth["theta"] - truth["q"]
         deflection_rate = truth["theta_dot"] - truth["q_dot"]
-        torque = joint_torque(deflection, deflection_rate, truth["stiffness"], self._damping, self._backlash)
+        torque = joint_torque(deflection, deflection_rate, truth["stiffness"], truth["damping"], truth["backlash"])
         zmp_ref = plan.zmp[row]
         deviation = truth["zmp"] - zmp_ref
         return {
@@ -348,6 +349,10 @@ class WalkTask(Stateful):
         copies = {name: s[name].copy() for name in names}
         return WalkTruth(**copies, pelvis_R=rotation_of(s["quaternion"]), model=self._true_model)
 
+    def robot_record(self, world: int) -> dict[str, float]:
+        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
+        return self._robot(world).record() if self.config.scenario.ranges else {}
+
     def _row(self, sample: WalkSample) -> IntArray:
         """Rows of the plan's tables."""
         return np.minimum(sample.rows["truth"]["step"], self.num_steps)
@@ -367,33 +372,37 @@ class WalkTask(Stateful):
         begin = draws.of_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
         direction = draws.of_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
         self._push_begin[world] = begin
-        self._push_force[world] = self.config.scenario.push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
+        self._push_force[world] = self._robot(world).push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
 
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
-        sensor, bias = self.config.scenario.inertial, self._bias
+        sensor, bias = _fitted(self.config.scenario, self._robot(world).is_inertial).inertial, self._bias
+        bias["gyro"][world] = bias["specific_force"][world] = 0.0
         if sensor is not None:
             bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
             bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
             bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
 
-    def _place(self, simulation: Simulation, world: int) -> Array:
-        """Give a world its robot, at rest; its true K, (12,) [N·m/rad]."""
-        scenario, draw = self.config.scenario, self._bank[self._draw[world]]
-        self._bias["encoder"][world] = draw.encoder_bias_rad
-        stiffness = self._true_model.stiffness * np.array(draw.stiffness_factor)
-        if scenario.stiffness_spread > 0.0 and self._springs is not None:
-            simulation.vary("tendon_stiffness")[world, self._springs] = stiffness
-        if scenario.slope_rad > 0.0:
-            floor = simulation.model.body("floor").id
-            simulation.vary("body_quat")[world, floor] = floor_tilt(scenario.slope_rad, draw.slope_direction_rad)
-        rest = equilibrium(self.config, draw)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        simulation.qpos[world] = rest.qpos
+    def _robot(self, world: int) -> RobotDraw:
+        """The robot of a world."""
+        return self._bank[self._draw[world]]
+
+    def _place(self, simulation: Simulation, world: int, truth: Records) -> None:
+        """Give a world its robot, at rest, and its truth the robot's joints."""
+        robot, model, bias = self._robot(world), self._true_model, self._bias
+        bias["encoder"][world] = robot.encoder_bias_rad
+        bias["fit"][world] = self._fits.index((robot.is_delayed, robot.is_inertial))
+        placed = placed_robot(self.config, robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+        for name, values in placed.fields.items():
+            simulation.vary(name)[world] = values
+        simulation.qpos[world] = placed.rest.qpos
         simulation.qvel[world] = 0.0
-        simulation.act[world] = rest.act
-        simulation.ctrl[world] = self.plan.q[0] - self._bias["encoder"][world]
-        simulation.bind("qacc_warmstart")[world] = rest.warmstart
-        return stiffness
+        simulation.act[world] = placed.rest.act
+        simulation.ctrl[world] = self.plan.q[0] - bias["encoder"][world]
+        simulation.bind("qacc_warmstart")[world] = placed.rest.warmstart
+        truth["stiffness"][world] = model.stiffness * np.array(robot.stiffness_factor)
+        truth["damping"][world] = model.damping * robot.damping_factor
+        truth["backlash"][world] = model.backlash + robot.backlash_rad
 
     def _earliness(self, truth: Records, row: IntArray) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
@@ -440,11 +449,25 @@ def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
     """Numbers that judge a control step, one row of `RULES`."""
     weights = one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()})
     return one(
-        RULES, control_period_s=config.control_period_s, is_delayed=config.scenario.delay_steps > 0,
+        RULES, control_period_s=config.control_period_s, is_delayed=False,
         loaded_n=loaded_n, zmp_n=zmp_n, weights=weights,
         lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m, highest_tilt_rad=FALL_TILT_RAD,
         highest_rad_s=DIVERGED_RAD_S,
     )  # fmt: skip
+
+
+def _delayed(rules: Records, is_delayed: bool) -> Records:
+    """The same rules for a robot whose measurements are shown a step late, or at once."""
+    found = rules.copy()
+    found["is_delayed"] = is_delayed
+    return found
+
+
+def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
+    """The scenario of a robot with an inertial IMU, its own or where robots are drawn that of the data sheet."""
+    if not is_inertial:
+        return scenario
+    return scenario.replace(ranges=(), inertial=scenario.inertial or InertialSensor())
 
 
 def _quality(scenario: Scenario, counts_per_turn: int | None, gravity_m_s2: float) -> Records:

@@ -1,0 +1,504 @@
+"""Robots drawn from ranges: the draws themselves, what of them reaches plant and sensors, and who may know of it."""
+
+import copy
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
+
+from elastic_env.core.config_problems import ModelError
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.robot_ranges import RobotDraw, RobotRanges, draw_robots, latin_hypercube
+from elastic_env.joint.elasticity import static_deflection
+from elastic_env.robots.thormang import config as walk_config
+from elastic_env.robots.thormang.config import floor_tilt, robot_bank
+from elastic_env.robots.thormang.environment import configure_walk
+from elastic_env.robots.thormang.environment import make as make_walk
+from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
+from elastic_env.robots.thormang.model import add_load, elastic_spec
+from elastic_env.runtime.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
+from elastic_env.runtime.sensors import InertialSensor
+
+SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
+MASS_KG = 57.0
+NAMES = [name for name, _ in RobotRanges().intervals()]
+
+
+def with_ranges(*ranges: RobotRanges, ground: str = "nominal") -> Scenario:
+    """A scenario that draws from some ranges."""
+    return make_scenario(ground).replace(ranges=ranges, name="own")
+
+
+def robot_of(env: Any, world: int = 0) -> RobotDraw:
+    """The robot that a world has drawn."""
+    return env.unwrapped.task._robot(world)
+
+
+def plant_of(env: Any, world: int) -> mujoco.MjModel:
+    """The model that a world steps: that of all, with the world's own fields."""
+    simulation = env.unwrapped.simulation
+    model = copy.copy(env.unwrapped.task.model)
+    for name in walk_config.drawn_fields(env.unwrapped.task.config.scenario):
+        getattr(model, name)[:] = simulation.vary(name)[world]
+    return model
+
+
+def is_within(ranges: RobotRanges, robot: RobotDraw) -> bool:
+    """Whether a robot lies in ranges; factors on K are taken together."""
+    lowest, highest = np.multiply(ranges.stiffness, ranges.joint_stiffness)
+    found: list[tuple[tuple[float, float], Any]] = [
+        ((lowest, highest), robot.stiffness_factor),
+        (ranges.damping, robot.damping_factor),
+        (ranges.friction, robot.friction_factor),
+        (ranges.backlash_rad, robot.backlash_rad),
+        (ranges.load_kg, robot.load_kg),
+        *zip((ranges.load_x_m, ranges.load_y_m, ranges.load_z_m), robot.load_place_m, strict=True),
+        (ranges.homing_rad, robot.encoder_bias_rad),
+        (ranges.mounting_rad, robot.imu_bias_rad),
+        (ranges.slope_rad, robot.slope_rad),
+    ]
+    is_unpushed = robot.push_n == 0.0 and (ranges.push_share < 1.0 or ranges.push_n[0] == 0.0)
+    if not is_unpushed:
+        found.append((ranges.push_n, robot.push_n))
+    shares = (ranges.delay_share, robot.is_delayed), (ranges.inertial_share, robot.is_inertial)
+    return all(np.all((low <= np.array(v)) & (np.array(v) <= high)) for (low, high), v in found) and all(
+        share > 0.0 if has else share < 1.0 for share, has in shares
+    )
+
+
+@st.composite
+def ranges_of(draw: st.DrawFn) -> RobotRanges:
+    """Ranges anywhere within their bounds."""
+    given_: dict[str, Any] = {}
+    for name in NAMES:
+        extra: Any = RobotRanges.model_fields[name].json_schema_extra
+        ends = st.floats(*extra["bounds"], allow_subnormal=False)
+        given_[name] = tuple(sorted([draw(ends), draw(ends)]))
+    for name in ("push_share", "delay_share", "inertial_share"):
+        given_[name] = draw(st.floats(0.0, 1.0))
+    return RobotRanges(**given_)
+
+
+# Draws.
+
+
+@settings(max_examples=40, deadline=None)
+@given(ranges_of(), st.integers(1, 12), st.integers(0, 2**31))
+def test_robots_lie_in_their_ranges(ranges: RobotRanges, number: int, seed: int) -> None:
+    """Catches a factor for an interval, a half-width for an end, and rounding beyond an end."""
+    robots = draw_robots([ranges], number, 3, [seed])
+    assert len(robots) == number
+    for robot in robots:
+        assert is_within(ranges, robot)
+        assert {len(robot.stiffness_factor), len(robot.encoder_bias_rad)} == {3}
+        assert 0.0 <= robot.slope_direction_rad <= 2.0 * math.pi
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 5), st.integers(0, 2**31))
+def test_a_latin_hypercube_has_one_value_in_each_interval(number: int, columns: int, seed: int) -> None:
+    """Catches independent draws, which leave gaps, and one order for all columns."""
+    points = latin_hypercube(number, columns, np.random.default_rng(seed))
+    assert points.shape == (number, columns)
+    for column in points.T:
+        np.testing.assert_array_equal(np.sort(np.floor(column * number)), np.arange(number))
+
+
+def test_the_bank_of_drawn_fills_its_ranges_evenly_and_its_quantities_are_independent() -> None:
+    """Catches a quantity that is drawn once for all robots, or along with another one."""
+    bank = robot_bank(make_scenario("drawn"))
+    assert len(bank) == walk_config.RANGES_BANK_SIZE == 256
+    columns = np.array(
+        [
+            [
+                *r.stiffness_factor, *r.encoder_bias_rad, *r.imu_bias_rad, *r.load_place_m, r.damping_factor,
+                r.friction_factor, r.backlash_rad, r.load_kg, r.slope_rad, r.slope_direction_rad,
+            ]
+            for r in bank
+        ]
+    )  # fmt: skip
+    joints = columns[:, :12]
+    assert 0.5 < np.corrcoef(joints.T)[0, 1] < 0.9  # a factor of their own, and one together
+    assert (joints.min(), joints.max()) == pytest.approx((0.6, 1.4), abs=0.04)
+    own = np.corrcoef(np.column_stack([joints.mean(axis=1), columns[:, 12:]]).T)
+    assert np.abs(own - np.eye(len(own))).max() < 5.0 / np.sqrt(256)
+    for column, name in ((-6, "damping"), (-5, "friction"), (-4, "backlash_rad"), (-3, "load_kg"), (-2, "slope_rad")):
+        low, high = getattr(TRAINING_RANGES, name)
+        np.testing.assert_allclose(np.sort(columns[:, column]), np.linspace(low, high, 256), atol=(high - low) / 256)
+    pushes = np.array([r.push_n for r in bank])
+    assert (pushes > 0.0).mean() == pytest.approx(0.5, abs=0.01)
+    assert pushes.max() <= 50.0
+    assert np.mean([r.is_delayed for r in bank]) == pytest.approx(0.5, abs=0.01)
+
+
+def test_banks_are_the_same_everywhere_and_have_robots_of_their_own() -> None:
+    """Catches robots that are new in every process, and an evaluation on robots that training has met."""
+    for name in ("drawn", "drawn_beyond"):
+        scenario = make_scenario(name)
+        bank = robot_bank(scenario)
+        assert robot_bank(scenario) == bank
+        assert not set(robot_bank(scenario, 1)) & set(bank)
+    assert robot_bank(make_scenario("drawn"))[0].damping_factor == pytest.approx(DAMPING_OF_THE_FIRST, rel=1e-12)
+
+
+DAMPING_OF_THE_FIRST = 0.5748213505602238
+"""Damping of the first robot of the bank, to notice a change of the draws."""
+
+
+def test_every_robot_of_drawn_beyond_has_one_quantity_beyond_the_ranges_of_drawn() -> None:
+    """Catches a held-out robot that training could have met."""
+    assert all(is_within(TRAINING_RANGES, robot) for robot in robot_bank(make_scenario("drawn")))
+    bank = robot_bank(make_scenario("drawn_beyond"))
+    assert len(bank) == 256
+    shares = np.linspace(0, 256, len(_BEYOND) + 1).round().astype(int)
+    for beyond, begin, end in zip(_BEYOND, shares, shares[1:], strict=False):
+        for robot in bank[begin:end]:
+            assert is_within(TRAINING_RANGES.replace(**beyond), robot)
+        (name, (low, high)), *_ = beyond.items()
+        inside = getattr(TRAINING_RANGES, name)
+        assert low >= inside[1] or high <= inside[0], name
+
+
+def test_a_range_that_changes_leaves_the_other_draws_as_they_are() -> None:
+    """Catches robots that all change with one interval, so that a comparison of two ranges is of other robots."""
+    one = draw_robots([TRAINING_RANGES], 16, 12, [3])
+    other = draw_robots([TRAINING_RANGES.replace(load_kg=(0.0, 0.0))], 16, 12, [3])
+    assert [robot.replace(load_kg=0.0) for robot in one] == other
+    assert max(robot.load_kg for robot in one) > 7.0
+
+
+def test_several_ranges_have_equal_shares() -> None:
+    light, heavy = RobotRanges(load_kg=(0.0, 1.0)), RobotRanges(load_kg=(5.0, 6.0))
+    robots = draw_robots([light, heavy, light], 9, 2, [0])
+    assert [robot.load_kg > 2.0 for robot in robots] == [False] * 3 + [True] * 3 + [False] * 3
+    assert len({robot.load_kg for robot in robots}) == 9
+
+
+@pytest.mark.parametrize(
+    ("given_", "message"),
+    [
+        ({"load_kg": (4.0, 2.0)}, r"load_kg must be \[lowest, highest\] within 0 to 100 \[kg\], got \[4, 2\]"),
+        ({"friction": (-1.0, 2.0)}, r"friction must be \[lowest, highest\] within 0 to 100 \[1\], got \[-1, 2\]"),
+        ({"load": (0.0, 2.0)}, "load"),
+        ({"delay_share": 1.5}, "delay_share"),
+        ({"load_kg": (0.0, math.nan)}, "load_kg"),
+    ],
+)
+def test_ranges_that_are_none_are_refused(given_: dict[str, Any], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        RobotRanges(**given_)
+
+
+def test_what_ranges_draw_is_not_said_twice() -> None:
+    """Catches a slope by the scenario and another one by its ranges, of which one would be lost."""
+    with pytest.raises(ConfigurationError, match="ranges say what is drawn; leave out slope_rad"):
+        make_scenario("slope+drawn")
+    with pytest.raises(ConfigurationError, match="leave out encoder_bias_rad, delay_steps"):
+        make_scenario("sensor+drawn")
+    with pytest.raises(ConfigurationError, match="sets ranges a second time"):
+        make_scenario("drawn+drawn_beyond")
+    with pytest.raises(ConfigurationError, match="ranges, which only a walker knows"):
+        gymnasium.make("elastic_env/Testbed-v0", scenario="drawn")
+    assert make_scenario("soft+drawn").stiffness_scale == 0.7
+    assert make_scenario("drawn").draws_robots
+
+
+# The plant.
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(worlds: int) -> None:
+    """Catches a field that is forgotten, such as inertias for the contacts after a change of mass."""
+    arguments: dict[str, Any] = {**SHORT, "scenario": "drawn"}
+    env: Any = make_walk(**arguments) if worlds == 1 else make_walk_vector(num_envs=worlds, **arguments)
+    env.reset(seed=2)
+    config, world = env.unwrapped.task.config, worlds - 1
+    robot, plant = robot_of(env, world), plant_of(env, world)
+    joints = {
+        name: joint.replace(
+            stiffness=joint.stiffness * factor,
+            damping=joint.damping * robot.damping_factor,
+            coulomb_friction=joint.coulomb_friction * robot.friction_factor,
+            backlash=robot.backlash_rad,
+        )
+        for (name, joint), factor in zip(config.true_joints.items(), robot.stiffness_factor, strict=True)
+    }
+    spec = elastic_spec(config.robot, joints, "tendon", config.timestep_s)
+    add_load(spec, robot.load_kg, np.array(robot.load_place_m))
+    spec.body("floor").quat = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
+    compiled = spec.compile()
+    generator, seen = np.random.default_rng(0), []
+    for model in (plant, compiled):
+        model.opt.tolerance = 0.0  # else the solver stops by the mean inertia, which is not of the robot
+    data, other = mujoco.MjData(plant), mujoco.MjData(compiled)
+    for _ in range(5):
+        data.qpos[:] = env.unwrapped.simulation.qpos[world] + 0.01 * generator.normal(size=plant.nq)
+        data.qvel[:] = 0.1 * generator.normal(size=plant.nv)
+        other.qpos[:], other.qvel[:] = data.qpos, data.qvel
+        mujoco.mj_forward(plant, data)
+        mujoco.mj_forward(compiled, other)
+        seen.append(np.abs(other.qacc).max())
+        np.testing.assert_allclose(data.qacc, other.qacc, rtol=0.0, atol=1e-12 * seen[-1])
+    assert min(seen) > 1.0
+    assert plant.body_mass.sum() == pytest.approx(MASS_KG + robot.load_kg, abs=1e-6)
+    assert robot.load_kg > 0.0
+
+
+def test_springs_sag_by_torque_over_stiffness() -> None:
+    """Catches a K or a dead band that is drawn and not used: at rest the servo's torque is that of the spring."""
+    env = make_walk_vector(num_envs=3, **SHORT, scenario=with_ranges(TRAINING_RANGES, ground="ideal"))
+    env.reset(seed=0)
+    truth, torque = env.unwrapped.truth(), np.array(env.unwrapped.simulation.bind("actuator_force"))
+    for world in range(3):
+        robot = robot_of(env, world)
+        K = 1001.0 * np.array(robot.stiffness_factor)
+        np.testing.assert_allclose(truth.stiffness[world], K, rtol=1e-12)
+        loaded = np.abs(torque[world]) > 1.0
+        sag = static_deflection(torque[world], K, robot.backlash_rad)
+        np.testing.assert_allclose((truth.theta - truth.q)[world][loaded], sag[loaded], rtol=0.0, atol=1e-5)
+        assert loaded.sum() >= 4
+    assert len({robot_of(env, world) for world in range(3)}) == 3
+
+
+def test_the_load_moves_the_center_of_mass_by_its_share_of_the_weight() -> None:
+    """Catches a load that sits elsewhere, or weighs nothing, by the center of mass that MuJoCo computes."""
+    scenario = with_ranges(
+        RobotRanges(load_kg=(6.0, 8.0), load_x_m=(0.05, 0.1), load_y_m=(-0.1, -0.05), load_z_m=(0.1, 0.15))
+    )
+    env = make_walk(**SHORT, scenario=scenario)
+    env.reset(seed=0)
+    robot, simulation = robot_of(env), env.simulation
+    body = {name: simulation.model.body(name).id for name in ("pelvis", "upper_body", "drawn_load")}
+    centers, masses = np.array(simulation.bind("xipos")[0]), np.array(simulation.vary("body_mass")[0])
+    R = np.array(simulation.bind("ximat")[0, body["upper_body"]]).reshape(3, 3)  # of the principal axes
+    frame = np.array(simulation.bind("xmat")[0, body["upper_body"]]).reshape(3, 3)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    load = centers[body["upper_body"]] + frame @ np.array(robot.load_place_m)
+    without = masses.copy()
+    without[body["drawn_load"]] = 0.0
+    bare = without @ centers / without.sum()
+    expected = bare + robot.load_kg / (MASS_KG + robot.load_kg) * (load - bare)
+    np.testing.assert_allclose(simulation.bind("subtree_com")[0, body["pelvis"]], expected, rtol=0.0, atol=1e-9)
+    assert 6.0 <= robot.load_kg <= 8.0
+
+
+@pytest.mark.parametrize("ground", ["nominal", "ideal"])
+def test_an_episode_of_a_drawn_robot_starts_at_rest(ground: str) -> None:
+    """Catches a robot that was settled with another load, ground or friction than it walks with."""
+    env = make_walk(**SHORT, scenario=with_ranges(TRAINING_RANGES.replace(push_n=(0.0, 0.0)), ground=ground))
+    _, info = env.reset(seed=1)
+    robot, start, reference = robot_of(env), env.truth(), env.task.assumed_model.plan.q
+    weight = (MASS_KG + robot.load_kg) * 9.81
+    for k in range(50):
+        assert info["force_left"] + info["force_right"] == pytest.approx(weight, abs=0.02)
+        *_, info = env.step((reference[0] - reference[k + 1]).astype(np.float32))
+    truth = env.truth()
+    assert np.abs(truth.q_dot).max() < 1e-3
+    for name in ("q", "theta", "pelvis", "ankles"):
+        np.testing.assert_allclose(getattr(truth, name), getattr(start, name), rtol=0.0, atol=1e-4, err_msg=name)
+
+
+def test_a_drawn_robot_that_cannot_stand_is_an_error_with_its_values() -> None:
+    """Catches an error that leaves open which of the ranges is too wide."""
+    env = make_walk(**SHORT, scenario=with_ranges(RobotRanges(load_kg=(90.0, 90.0), load_x_m=(0.9, 0.9))))
+    with pytest.raises(
+        ConfigurationError, match=r"load_kg=90\.0 .*load_place_m=\(0\.9, .* does not stand.*narrow the ran"
+    ):
+        env.reset(seed=0)
+
+
+def test_fields_follow_the_robot_from_episode_to_episode() -> None:
+    """Catches a world that keeps something of the robot that it had before, and one that changes another world's."""
+    env: Any = make_walk_vector(num_envs=2, **SHORT, scenario="drawn")
+    env.reset(seed=[4, 5])
+    first = [plant_of(env, world) for world in (0, 1)]
+    env.reset(seed=[6, 5], options={"reset_mask": np.array([True, False])})
+    second = [plant_of(env, world) for world in (0, 1)]
+    env.reset(seed=[4, 5])
+    third = [plant_of(env, world) for world in (0, 1)]
+    for name in walk_config.drawn_fields(make_scenario("drawn")):
+        values = [[getattr(model, name) for model in models] for models in (first, second, third)]
+        np.testing.assert_array_equal(values[1][1], values[0][1], err_msg=name)
+        np.testing.assert_array_equal(values[2][0], values[0][0], err_msg=name)
+        if name != "dof_damping":  # without viscous friction
+            assert not np.array_equal(values[1][0], values[0][0]), name
+
+
+def test_signals_know_the_drawn_joints() -> None:
+    """Catches a joint torque that is computed with the assumed damping or dead band."""
+    env = make_walk(**SHORT, scenario="drawn")
+    env.reset(seed=0)
+    robot, generator = robot_of(env), np.random.default_rng(0)
+    for _ in range(20):
+        *_, info = env.step(generator.uniform(-0.02, 0.02, 12).astype(np.float32))
+    truth = env.truth()
+    delta, rate = truth.theta - truth.q, truth.theta_dot - truth.q_dot
+    spring = np.sign(delta) * np.maximum(np.abs(delta) - robot.backlash_rad / 2.0, 0.0)
+    torque = 1001.0 * np.array(robot.stiffness_factor) * spring + 10.0 * robot.damping_factor * rate
+    assert info["joint_torque"] == pytest.approx(np.abs(torque).max(), rel=1e-12)
+    assert robot.backlash_rad > 0.0
+
+
+# Ground, pushes, sensors.
+
+
+def test_floor_and_pushes_are_those_of_the_robot() -> None:
+    """Catches a slope or a push by the scenario for all robots, or none."""
+    ranges = RobotRanges(slope_rad=(0.01, 0.02), push_n=(20.0, 50.0))
+    env: Any = make_walk_vector(num_envs=3, **SHORT, scenario=with_ranges(ranges))
+    env.reset(seed=0)
+    floor = env.unwrapped.task.model.body("floor").id
+    torso = env.unwrapped.task.model.body("upper_body").id
+    largest = np.zeros(3)
+    for _ in range(540):
+        env.step(np.zeros((3, 12), np.float32))
+        force = np.array(env.unwrapped.simulation.bind("xfrc_applied")[:, torso])
+        largest = np.maximum(largest, np.linalg.norm(force[:, :3], axis=1))
+    robots = [robot_of(env, world) for world in range(3)]
+    np.testing.assert_allclose(largest, [robot.push_n for robot in robots], rtol=1e-12)
+    quaternions = env.unwrapped.simulation.vary("body_quat")[:, floor]
+    np.testing.assert_allclose(2.0 * np.arccos(quaternions[:, 0]), [r.slope_rad for r in robots], rtol=1e-6)
+    assert len({robot.push_n for robot in robots}) == 3
+
+
+def test_encoders_and_imu_are_off_by_what_was_drawn() -> None:
+    """Catches an error that is drawn and not shown, or shown with the other sign."""
+    ranges = RobotRanges(homing_rad=(-2e-3, 2e-3), mounting_rad=(-2e-3, 2e-3))
+    env: Any = make_walk_vector(num_envs=3, **SHORT, scenario=with_ranges(ranges, ground="ideal"))
+    observation, info = env.reset(seed=0)
+    robots = [robot_of(env, world) for world in range(3)]
+    encoder = observation[:, :12] - env.unwrapped.truth().theta
+    np.testing.assert_allclose(encoder, [robot.encoder_bias_rad for robot in robots], rtol=0.0, atol=1e-12)
+    imu = observation[:, 24:26] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+    np.testing.assert_allclose(imu, [robot.imu_bias_rad for robot in robots], rtol=0.0, atol=1e-12)
+
+
+def test_measurements_are_old_in_the_worlds_of_delayed_robots_alone() -> None:
+    """Catches an age that is that of all worlds, and one that further sensors do not have."""
+    scenario = with_ranges(RobotRanges(delay_share=0.5), ground="ideal")
+    env: Any = make_walk_vector(num_envs=6, **SHORT, scenario=scenario, sensors=["link_encoder"])
+    observation, _ = env.reset(seed=0)
+    is_delayed = np.array([robot_of(env, world).is_delayed for world in range(6)])
+    assert 0 < is_delayed.sum() < 6
+    generator, link = np.random.default_rng(0), env.unwrapped.task.observation_table.group("link_encoder")
+    for _ in range(30):
+        before = env.unwrapped.truth()
+        observation, *_ = env.step(generator.uniform(-0.02, 0.02, (6, 12)).astype(np.float32))
+        now = env.unwrapped.truth()
+        for column, name in ((slice(0, 12), "theta"), (link, "q")):
+            shown = np.where(is_delayed[:, None], getattr(before, name), getattr(now, name))
+            np.testing.assert_allclose(observation[:, column], shown, rtol=0.0, atol=1e-12)
+    assert np.abs(now.theta - before.theta).max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("ranges", "fixed"),
+    [
+        ({"inertial_share": 1.0, "delay_share": 1.0}, {"inertial": InertialSensor(), "delay_steps": 1}),
+        ({"push_n": (50.0, 50.0)}, {"push_n": 50.0}),
+        ({"delay_share": 1.0}, {"delay_steps": 1}),
+    ],
+)  # fmt: skip
+def test_a_range_of_one_value_is_the_condition_of_that_value(
+    monkeypatch: pytest.MonkeyPatch, ranges: dict[str, Any], fixed: dict[str, Any]
+) -> None:
+    """Catches a second mechanism beside that of the named scenarios: the same numbers must come out."""
+    monkeypatch.setattr(walk_config, "RANGES_BANK_SIZE", 1)
+    nominal = make_scenario("nominal")
+    seen = []
+    for scenario in (nominal.replace(ranges=[RobotRanges(**ranges)]), nominal.replace(**fixed)):
+        env = make_walk(**SHORT, scenario=scenario)
+        rows = [env.reset(seed=3)[0]]
+        rows += [env.step(np.full(12, 1e-3, np.float32))[0] for _ in range(400)]
+        seen.append(np.array(rows))
+    np.testing.assert_allclose(*seen, rtol=0.0, atol=1e-6 if "push_n" not in ranges else 1e-5)
+
+
+def test_robots_with_and_without_an_inertial_imu_walk_side_by_side() -> None:
+    """Catches an IMU of one robot that shows what another one's does: only one of both has the true attitude."""
+    scenario = with_ranges(RobotRanges(inertial_share=0.5), ground="ideal")
+    env: Any = make_walk_vector(num_envs=6, **SHORT, scenario=scenario)
+    observation, info = env.reset(seed=0)
+    has = np.array([robot_of(env, world).is_inertial for world in range(6)])
+    error = observation[:, 24:26] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+    assert 0 < has.sum() < 6
+    assert (np.abs(error[~has]) < 1e-12).all()
+    assert (np.abs(error[has]).max(axis=1) > 1e-4).all()
+
+
+# Who may know.
+
+
+def test_a_policy_assumes_the_nominal_robot() -> None:
+    """Catches a compensator that knows friction, K or load of the robot that was drawn."""
+    nominal, drawn = (configure_walk(**SHORT, scenario=name) for name in ("nominal", "drawn"))
+    assert drawn.assumed_joints == nominal.assumed_joints
+    env = make_walk(**SHORT, scenario="drawn")
+    env.reset(seed=0)
+    assert env.assumed_model.rigid.body_mass.sum() == pytest.approx(MASS_KG, abs=1e-6)
+    assert env.truth().stiffness[0].tolist() != [1001.0] * 12
+
+
+# The same everywhere.
+
+
+@pytest.mark.parametrize("worlds", [2, 5])
+def test_a_seed_has_the_same_robot_in_any_number_of_worlds(worlds: int) -> None:
+    """Catches a draw that depends on the other worlds: bits of a scalar environment against those of a row."""
+    seeds = [7, 8, 9, 10, 11][:worlds]
+    env: Any = make_walk_vector(num_envs=worlds, **SHORT, scenario="drawn")
+    alone = make_walk(**SHORT, scenario="drawn")
+    observation, _ = env.reset(seed=seeds)
+    np.testing.assert_array_equal(observation[-1], alone.reset(seed=seeds[-1])[0])
+    assert robot_of(env, worlds - 1) == robot_of(alone)
+    generator = np.random.default_rng(0)
+    for _ in range(60):
+        action = generator.uniform(-0.01, 0.01, (worlds, 12)).astype(np.float32)
+        many, one = env.step(action), alone.step(action[-1])
+        np.testing.assert_array_equal(many[0][-1], one[0])
+        assert many[1][-1] == one[1]
+
+
+def test_a_robot_walks_again_under_other_noise() -> None:
+    """Catches a robot_seed that draws another robot from the ranges."""
+    env = make_walk(**SHORT, scenario="drawn")
+    first, _ = env.reset(seed=3)
+    robot = robot_of(env)
+    again, _ = env.reset(seed=4, options={"robot_seed": 3})
+    assert robot_of(env) == robot
+    assert not np.array_equal(first, again)
+
+
+def test_checkers_of_gymnasium_and_stable_baselines3_find_nothing() -> None:
+    """Catches an environment whose seeding or spaces break where robots are drawn."""
+    check_env(make_walk(**SHORT, scenario="drawn"), skip_render_check=True)
+    check_sb3_env(make_walk(**SHORT, scenario="drawn"), skip_render_check=True)
+    env: Any = make_walk_vector(num_envs=2, **SHORT, scenario="drawn")
+    first, second = (env.reset(seed=1) for _ in range(2))
+    assert data_equivalence(first[0], second[0])
+
+
+def test_the_table_of_ranges_is_that_of_the_code() -> None:
+    """Catches a range in docs/walker.md that is not drawn from, and one that is missing there."""
+    text = (Path(__file__).parents[1] / "docs" / "walker.md").read_text(encoding="utf-8")
+    section = text[text.index("## Drawn robots") : text.index("## The IMU")].replace("−", "-")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| `")]
+    table = {cells[0].strip("`"): (cells[1], cells[2]) for cells in rows}
+    beyond: dict[str, list[str]] = {}
+    for changes in _BEYOND:
+        (name, (low, high)), *_ = changes.items()
+        beyond.setdefault(name, []).append(f"{low:.4g} to {high:.4g}")
+    for name in RobotRanges.model_fields:
+        value = getattr(TRAINING_RANGES, name)
+        drawn = f"{value:g}" if isinstance(value, float) else "{:.4g} to {:.4g}".format(*value)
+        assert table.pop(name) == (drawn, "1, where `push_n` is beyond" if name == "push_share" else
+                                   "; ".join(beyond.get(name, []))), name  # fmt: skip
+    assert set(table) == {"drawn", "drawn_beyond"}  # of the table of figures
