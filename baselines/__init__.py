@@ -10,7 +10,8 @@ from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
 from baselines.compensation.policy import Policy
 from baselines.policies import RESIDUAL, make, policy_names
-from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.correction import Corrected
+from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 
 __all__ = [

@@ -5,7 +5,7 @@ commands the robot, rewards are summed, and the next observation is that of the 
 a decision takes no further part in it: its observation and reward are those up to its end.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,8 +17,9 @@ from gymnasium.vector.utils import batch_space
 
 from baselines.compensation.policy import Policy
 from baselines.policies import make
-from baselines.residual.correction import Corrected, ResidualSettings, Space
+from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
+from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.state import Stateful
@@ -60,18 +61,22 @@ class _Deciding(Stateful):
         self._start = np.zeros_like(self._start)
         return action
 
-    def checked(self, residual: Any, shape: tuple[int, ...]) -> Array:
-        """A residual as numbers within [−1, 1]."""
+    def decided(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
+        """A residual for the observations of its decision as numbers within [−1, 1], out of the mirror."""
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
             raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {residual!r}")
-        return np.clip(given, -1.0, 1.0)
+        clipped = np.clip(given, -1.0, 1.0)
+        return self.features.turned_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
 
 
-def _settings(
-    space: Space, scale: float | dict[str, float] | None, decision_period: int, further: dict[str, Any]
-) -> ResidualSettings:
-    return ResidualSettings(space=space, scale=scale, decision_period=decision_period, **further)
+ActsOn = Mapping[str, Bound | None]
+"""Inputs, and the value of each at a residual of 1."""
+
+
+def _settings(acts_on: ActsOn | None, decision_period: int, further: dict[str, Any]) -> ResidualSettings:
+    chosen = {} if acts_on is None else {"acts_on": dict(acts_on)}
+    return ResidualSettings(**chosen, decision_period=decision_period, **further)
 
 
 class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
@@ -80,9 +85,8 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
     Args:
         env: An environment of ours.
         base_policy: A policy for it, or the name of one.
-        space: "model" or "joint", see `baselines.residual.correction`.
-        scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
-            by the end of their names; None for 0.6 or 0.02 rad.
+        acts_on: Inputs of the base that the residual acts on, each with its bound, see `ResidualSettings`; None for
+            the deflection that the base compensates.
         decision_period: Control steps per decision.
         **settings: Further parameters of `ResidualSettings`.
 
@@ -94,16 +98,15 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         self,
         env: gymnasium.Env[Any, Any],
         base_policy: Policy | str,
-        space: Space = "model",
-        scale: float | dict[str, float] | None = None,
+        acts_on: ActsOn | None = None,
         decision_period: int = 25,
         **settings: Any,
     ) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(
-            self, base_policy=base_policy, space=space, scale=scale, decision_period=decision_period, **settings
+            self, base_policy=base_policy, acts_on=acts_on, decision_period=decision_period, **settings
         )
         gymnasium.Wrapper.__init__(self, env)
-        self._deciding = _Deciding(env, base_policy, _settings(space, scale, decision_period, settings), 1)
+        self._deciding = _Deciding(env, base_policy, _settings(acts_on, decision_period, settings), 1)
         self.observation_space = _box(self._deciding.features.width)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._deciding.corrected.num_residuals,), np.float32)
         self._last = np.zeros(0)
@@ -123,7 +126,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.checked(action, self.action_space.shape or ())[None]
+        residual = self._deciding.decided(self._last[None], action, self.action_space.shape or ())[None]
         total, terminated, truncated, info = 0.0, False, False, {}
         for _ in range(self.settings.decision_period):
             command = self._deciding.act(self._last[None], residual)[0]
@@ -142,9 +145,8 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
     Args:
         env: A vector environment of ours.
         base_policy: A policy for it, or the name of one.
-        space: "model" or "joint", see `baselines.residual.correction`.
-        scale: Correction at a residual of 1, relative for "model", in rad for "joint"; one for all joints, or a mapping
-            by the end of their names; None for 0.6 or 0.02 rad.
+        acts_on: Inputs of the base that the residual acts on, each with its bound, see `ResidualSettings`; None for
+            the deflection that the base compensates.
         decision_period: Control steps per decision.
         autoreset_mode: When; None as the environment would.
         **settings: Further parameters of `ResidualSettings`.
@@ -159,14 +161,13 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         self,
         env: gymnasium.vector.VectorEnv[Any, Any, Any],
         base_policy: Policy | str,
-        space: Space = "model",
-        scale: float | dict[str, float] | None = None,
+        acts_on: ActsOn | None = None,
         decision_period: int = 25,
         autoreset_mode: AutoresetMode | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(env)
-        chosen = _settings(space, scale, decision_period, settings)
+        chosen = _settings(acts_on, decision_period, settings)
         self._deciding = _Deciding(env, base_policy, chosen, env.num_envs)
         inner: Any = env.unwrapped
         self.autoreset_mode = autoreset_mode or inner.autoreset_mode
@@ -217,7 +218,7 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.checked(actions, self.action_space.shape or ())
+        residual = self._deciding.decided(self._rows, actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
         outcome = self._decide(residual, ~waiting)
         self._decisions += 1

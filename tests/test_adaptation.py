@@ -11,6 +11,7 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.estimators import mean_load
 from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
+from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import DeflectionSensors
 from baselines.estimation.joint_stiffness import PRESLIDING_RAD, StiffnessPrior, friction_after, regressed
 from baselines.policies import sensors_needed
@@ -91,8 +92,9 @@ class Recorded:
     def __init__(self) -> None:
         self.corrections: list[Array] = []
 
-    def predict_corrected(self, observation: Array, correction: Array, *call: Any) -> tuple[Array, Any]:
-        self.corrections.append(correction[0])
+    def predict_with(self, observation: Array, inputs: PolicyInputs, *call: Any) -> tuple[Array, Any]:
+        assert inputs.deflection is not None
+        self.corrections.append(inputs.deflection[0])
         return np.zeros(12, np.float32), None
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
@@ -106,8 +108,8 @@ def test_the_correction_is_filtered_and_joined_with_another() -> None:
     inner = Recorded()
     policy, state = OnlineStiffness(inner, model, Fixed(), gains), None
     for step, observation in enumerate(recording()[:50]):
-        further = np.full((1, 12), 0.1) if step == 49 else None
-        _, state = policy.predict_corrected(observation, further, state, step == 0)
+        further = PolicyInputs(deflection=np.full((1, 12), 0.1) if step == 49 else None)
+        _, state = policy.predict_with(observation, further, state, step == 0)
     share = 1.0 - np.exp(-np.arange(1, 51) * PERIOD_S / gains.filter_s)
     expected = gains.limit * share  # the target of 0.5 is bounded
     np.testing.assert_allclose(np.array(inner.corrections)[:49, 3], expected[:49])

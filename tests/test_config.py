@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from baselines.policies import PolicyOptions
-from baselines.residual.correction import ResidualSettings
+from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import Model, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError, missing_extra, unknown_name
 from elastic_env.core.yaml_text import parse_yaml

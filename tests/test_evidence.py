@@ -9,10 +9,11 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.correction import Corrected
 from baselines.residual.evidence import ERROR_SCALE, LOAD_SCALE, Evidence, evidence
 from baselines.residual.features import Features
 from baselines.residual.residual import Network, ResidualDescription, ResidualPolicy
+from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualWrapper
 from elastic_env.core.errors import ConfigurationError
 

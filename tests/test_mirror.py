@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import baselines
-from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.mirror import Mirror
+from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.runtime.robot_model import WalkerModel
@@ -118,11 +119,9 @@ def test_residuals_see_the_mirror_image_while_the_right_foot_is_that_of_the_step
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"shared": False}, "shared: false"),
-        ({"space": "joint"}, "'joint'"),
         ({"observe": ("wrench.l_fx",)}, "no wrench.r_fx; observe both"),
         ({"joints": ("l_knee",)}, "not for l_knee; name joints without"),
-        ({"joints": ("knee",), "scale": {"l_knee": 0.2, "r_knee": 0.6}}, "not for l_knee"),
+        ({"acts_on": {"deflection": {"l_knee": 0.2, "r_knee": 0.6}}}, "not for l_knee"),
     ],
 )
 def test_what_has_no_mirror_image_is_refused(settings: dict[str, Any], message: str) -> None:

@@ -18,8 +18,10 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
+from baselines.compensation.inputs import input_signals
 from baselines.estimation.bending import BendingObserver
-from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.channels import Channels
+from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual import (
     Network,
@@ -30,6 +32,7 @@ from baselines.residual.residual import (
     save_residual,
     shipped,
 )
+from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper, ResidualWrapper
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array
@@ -163,21 +166,30 @@ def test_the_correction_passes_a_first_order_low_pass() -> None:
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-8)
 
 
-def test_joints_and_scales_are_chosen_by_name() -> None:
-    """Catches an order of joints that is not the robot's, and a scale that goes to another joint."""
-    env = scalar("walker")
-    settings = ResidualSettings(
-        space="joint", joints=("ankle_roll", "l_knee"), scale={"ankle_roll": 0.01, "knee": 0.03}
-    )
-    names = env.unwrapped.assumed_model.joint_names  # type: ignore[attr-defined]
-    assert [names[j] for j in settings.corrected_joints(names)] == ["l_knee", "l_ankle_roll", "r_ankle_roll"]
-    np.testing.assert_array_equal(settings.scales(names), [0.03, 0.01, 0.01])
+def test_joints_and_bounds_are_chosen_by_name() -> None:
+    """Catches an order of joints that is not the robot's, and a bound that goes to another joint or axis."""
+    model = scalar("walker").unwrapped.assumed_model  # type: ignore[attr-defined]
+    bounds = {"ankle_roll": 0.01, "knee": 0.03}
+
+    def acting(**settings: Any) -> dict[str, float]:
+        channels = Channels(model, ResidualSettings(**settings))
+        assert channels.wanted(np.ones((1, len(channels.signals)))).tolist() == [channels.bounds.tolist()]
+        columns = [signal.name for name in settings["acts_on"] for signal in input_signals(name, model)]
+        return {name: bound for name, bound in zip(columns, channels.bounds.tolist(), strict=True) if bound}
+
+    joints = ("ankle_roll", "l_knee")
+    assert acting(acts_on={"command": bounds}, joints=joints) == {
+        "command.l_knee": 0.03, "command.l_ankle_roll": 0.01, "command.r_ankle_roll": 0.01,
+    }  # fmt: skip
+    assert acting(acts_on={"deflection": {"r_knee": 0.5}, "zmp": {"y": 0.01}, "hip": None}) == {
+        "deflection.r_knee": 0.5, "zmp.y": 0.01, "hip.roll": 0.02, "hip.pitch": 0.02,
+    }  # fmt: skip
     with pytest.raises(ConfigurationError, match=r"'elbow'.*l_hip_yaw"):
-        ResidualSettings(joints=("elbow",)).corrected_joints(names)
-    with pytest.raises(ConfigurationError, match=r"every corrected joint.*l_hip_yaw"):
-        ResidualSettings(scale={"knee": 0.1}).scales(names)
-    with pytest.raises(ConfigurationError, match="compensates none; use space 'joint'"):
-        around(env, "uncompensated", space="model")
+        acting(acts_on={"deflection": None}, joints=("elbow",))
+    with pytest.raises(ConfigurationError, match=r"every joint of `joints`.*l_ankle_roll"):
+        acting(acts_on={"deflection": {"knee": 0.1}}, joints=joints)
+    with pytest.raises(ConfigurationError, match=r"unknown axis of an input 'z'.*x, y"):
+        acting(acts_on={"zmp": {"z": 0.01}})
 
 
 @pytest.mark.parametrize(("robot", "base", "space"), BASES[1:5:3] + BASES[6:7])

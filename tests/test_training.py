@@ -481,7 +481,7 @@ def test_train_command_trains_every_seed_and_resumes(
         ({"weights": {"soft": 2.0}}, r"learned from, \['nominal'\], got 'soft'"),
         ({"weights": {"nominal": -1.0}}, "greater than 0"),
         ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
-        ({"base": "zero"}, "compensates none; use space 'joint'"),
+        ({"base": "zero"}, "acts on deflection, which Zero does not have.*command"),
         ({"algorithm_options": {"foo": 1}}, "PPO cannot be built with algorithm_options .*foo"),
         ({"algorithm_options": {"policy_kwargs": {"activation_fn": "Foo"}}}, "PPO cannot be built .*Foo"),
         ({"algorithm_options": {"learning_rate": "x"}}, "PPO cannot be built .*'x'"),

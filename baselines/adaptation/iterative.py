@@ -12,7 +12,15 @@ import numpy as np
 
 from baselines.adaptation.iterative_learning import credible, updated
 from baselines.adaptation.learned_signals import LearnedSignals
-from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from baselines.compensation.inputs import PolicyInputs, inputs_of
+from baselines.compensation.policy import (
+    Action,
+    ObservationView,
+    Policy,
+    PolicyWithInputs,
+    predicted,
+    taken_up,
+)
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
@@ -22,7 +30,7 @@ _RETREAT = 0.5
 """Share of the offsets that is kept after a trial that failed, such as by a fall."""
 
 
-class LearnedOffsets:
+class LearnedOffsets(PolicyWithInputs):
     """Any policy with a table of offsets added, row by row from the start of an episode.
 
     Memory per world: control steps since the start, then that of the policy.
@@ -56,14 +64,24 @@ class LearnedOffsets:
         self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
         self.tables = tables
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Those of the policy inside it."""
+        return inputs_of(self._policy)[1:]
+
+    def predict_with(
+        self,
+        observation: Array,
+        inputs: PolicyInputs,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """Action and new state."""
+        """Action and new state; all inputs are passed on."""
         rows = self._view.rows(observation)
         begun = np.zeros((len(rows), 1))
         steps, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
-        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
+        action, inner = predicted(self._policy, observation, inputs, inner, episode_start, deterministic)
         steps = steps + 1.0
         total = np.asarray(action, dtype=np.float64) + self._at(steps[:, 0]).reshape(np.shape(action))
         return total.astype(np.float32), (steps, inner)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from baselines.adaptation.estimators import Estimator
-from baselines.compensation.policy import Action, Correctable, ObservationView, taken_up
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import RobotModel
@@ -26,7 +27,7 @@ class AdaptationGains(Model):
     limit: float = quantity("1", 1.0, gt=0, lt=10, description="largest correction of the deflection")
 
 
-class OnlineStiffness(Correctable):
+class OnlineStiffness(PolicyWithInputs):
     """A compensated policy whose model of the joints is corrected by what is measured, see the module.
 
     Memory per world: steps, target and filtered r of the joints, then that of the estimator.
@@ -39,7 +40,7 @@ class OnlineStiffness(Correctable):
     """
 
     def __init__(
-        self, policy: Correctable, model: RobotModel, estimator: Estimator, gains: AdaptationGains | None = None
+        self, policy: PolicyWithInputs, model: RobotModel, estimator: Estimator, gains: AdaptationGains | None = None
     ) -> None:
         gains = gains or AdaptationGains()
         self._policy, self._estimator, self._n = policy, estimator, len(model.joint_names)
@@ -47,25 +48,32 @@ class OnlineStiffness(Correctable):
         self._every = max(round(gains.period_s / model.control_period_s), 1)
         self._gain, self._limit = 1.0 - float(np.exp(-model.control_period_s / gains.filter_s)), gains.limit
 
-    def predict_corrected(
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """See `PolicyWithInputs`."""
+        return self._policy.inputs
+
+    def predict_with(
         self,
         observation: Array,
-        correction: Array | None,
+        inputs: PolicyInputs,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """See `Correctable`; a further correction r' comes on top, (1 + r) (1 + r') δ."""
+        """See `PolicyWithInputs`; the input `deflection` r' comes on top, (1 + r) (1 + r') δ."""
         rows, n = self._view.rows(observation), self._n
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._begin(len(rows)))
         memory = self._adapted(rows, memory)
         own = memory[:, 1 + n : 1 + 2 * n]
-        together = own if correction is None else (1.0 + own) * (1.0 + correction) - 1.0
-        action, inner = self._policy.predict_corrected(observation, together, inner, episode_start, deterministic)
+        further = inputs.deflection
+        together = own if further is None else (1.0 + own) * (1.0 + further) - 1.0
+        corrected = inputs.with_deflection(together)
+        action, inner = self._policy.predict_with(observation, corrected, inner, episode_start, deterministic)
         return action, (memory, inner)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `Correctable`."""
+        """See `PolicyWithInputs`."""
         return self._policy.link_estimate(observation, state[1])
 
     def _begin(self, num_worlds: int) -> Array:

@@ -5,13 +5,15 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.compensators import Compensator
-from baselines.compensation.policy import Action, Correctable, ObservationView, Policy, taken_up
+from baselines.compensation.inputs import DEFLECTION, PolicyInputs, inputs_of, shifted_share
+from baselines.compensation.policy import Action, ObservationView, Policy, PolicyWithInputs, predicted, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
+from elastic_env.runtime.robot_model import WalkerModel
 
 
-class Compensated(Correctable):
+class Compensated(PolicyWithInputs):
     """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
 
     The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees the estimated link
@@ -23,8 +25,7 @@ class Compensated(Correctable):
             attribute `reads_rates = False`, which saves their estimate.
         compensator: Where the motor has to lead, and where the link is.
         ramp_s: Duration of the ramp.
-        corrects_policy: Whether a correction of the deflection also reaches the policy, by its `predict_winding`, as
-            one that winds springs needs it.
+        corrects_policy: Whether the input `deflection` also reaches the policy, as one that winds springs needs it.
     """
 
     def __init__(
@@ -41,16 +42,24 @@ class Compensated(Correctable):
         self._view = ObservationView(model.observation_table, model.control_period_s)
         self._ramp = Ramp(model, ramp_s)
 
-    def predict_corrected(
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """See `PolicyWithInputs`."""
+        return (DEFLECTION, *inputs_of(self.policy)[1:])
+
+    def predict_with(
         self,
         observation: Array,
-        correction: Array | None,
+        inputs: PolicyInputs,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """See `Correctable`."""
-        rows, n = self._view.rows(observation), self._num_joints
+        """See `PolicyWithInputs`; it takes `deflection`, r: what is compensated, and seen, is (1 + r) δ.
+
+        The contact forces that load the joints act where the policy shifts the ZMP.
+        """
+        rows, n, correction = self._shifted(self._view.rows(observation), inputs), self._num_joints, inputs.deflection
         desired, compensator = self._view.motion(rows), self.compensator.at(rows)
         memory, inner_state = taken_up(
             state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1 + n, 0)))
@@ -58,12 +67,9 @@ class Compensated(Correctable):
         own = memory[:, 1 + n :]
         links = self._links(compensator, rows, own, correction)
         seen = self._seen(compensator, rows, links)
-        call = inner_state, episode_start, deterministic
         shown = seen if observation.ndim > 1 else seen[0]
-        if self._corrects_policy:
-            action, inner_state = self.policy.predict_winding(shown, correction, *call)  # type: ignore[attr-defined]
-        else:
-            action, inner_state = self.policy.predict(shown, *call)
+        others = inputs if self._corrects_policy else inputs.with_deflection(None)
+        action, inner_state = predicted(self.policy, shown, others, inner_state, episode_start, deterministic)
         action = np.atleast_2d(np.asarray(action, dtype=np.float64))
         offset, kept = compensator.offset(desired.shifted(action), own)
         if correction is not None:
@@ -73,9 +79,20 @@ class Compensated(Correctable):
         return total.reshape((*observation.shape[:-1], n)), (np.hstack([steps, links, kept]), inner_state)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `Correctable`."""
+        """See `PolicyWithInputs`."""
         memory, _ = state
         return memory[:, 1 : 1 + self._num_joints].reshape((*observation.shape[:-1], self._num_joints))
+
+    def _shifted(self, rows: Array, inputs: PolicyInputs) -> Array:
+        """The observations with ZMP and load share of the plan as the inputs shift them."""
+        shift, model = inputs.zmp_shift, self.compensator.model
+        if shift is None or not isinstance(model, WalkerModel):
+            return rows
+        rows, table = rows.copy(), model.observation_table
+        share, zmp = table.group("load_share"), table.group("zmp_reference")
+        rows[:, zmp] += shift
+        rows[:, share] = shifted_share(rows[:, share], shift[:, 1:], model.biped.foot_spacing)
+        return rows
 
     def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
         """The links' angles by the encoders."""

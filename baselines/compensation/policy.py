@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from baselines.compensation.compensators import Motion
+from baselines.compensation.inputs import NO_INPUTS, PolicyInputs
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 
@@ -28,8 +29,13 @@ class Policy(Protocol):
         ...
 
 
-class Correctable(ABC):
-    """A policy that compensates a modelled deflection, which can be corrected."""
+class PolicyWithInputs(ABC):
+    """A policy in whose own quantities something outside can act, see `baselines.compensation.inputs`."""
+
+    @property
+    @abstractmethod
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs that it has beside `command`: its own, and those of the policies inside it."""
 
     def predict(
         self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -39,23 +45,22 @@ class Correctable(ABC):
         Raises:
             ElasticError: Called in the middle of an episode without the state of the last call.
         """
-        return self.predict_corrected(observation, None, state, episode_start, deterministic)
+        return self.predict_with(observation, NO_INPUTS, state, episode_start, deterministic)
 
     @abstractmethod
-    def predict_corrected(
+    def predict_with(
         self,
         observation: Array,
-        correction: Array | None,
+        inputs: PolicyInputs,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """`predict` with another model of the joints: the deflection that is compensated, and seen, is (1 + r) δ.
+        """`predict` under inputs: a policy takes what is its own and passes on the rest.
 
         Args:
             observation: As in `predict`.
-            correction: Relative change r of the deflection, (num_worlds, n) [1]; None for none. Zeros are the same to
-                the last bit.
+            inputs: Their values; zeros are as if there were none, to the last bit.
             state: As in `predict`.
             episode_start: As in `predict`.
             deterministic: As in `predict`.
@@ -69,6 +74,20 @@ class Correctable(ABC):
             observation: As in `predict`.
             state: What `predict` returned for it.
         """
+
+
+def predicted(policy: Any, observation: Array, inputs: PolicyInputs, *call: Any) -> tuple[Any, Any]:
+    """Action and new state of a policy under inputs; one that gets none need not know of any.
+
+    Args:
+        policy: Any policy.
+        observation: As in `predict`.
+        inputs: What is left for it.
+        *call: state, episode_start and deterministic as in `predict`.
+    """
+    if inputs.is_empty:
+        return policy.predict(observation, *call)
+    return policy.predict_with(observation, inputs, *call)
 
 
 class Zero:

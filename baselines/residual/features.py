@@ -109,6 +109,15 @@ class Features:
             features = self._mirror(rows, features)
         return features, np.hstack([remembered, *(kept for _, kept in observed)])
 
+    def turned_back(self, rows: Array, residual: Array) -> Array:
+        """What a residual comes to that was decided in the mirror, (num_worlds, k); itself without one.
+
+        Args:
+            rows: Observations of the decision.
+            residual: What was decided by their features.
+        """
+        return residual if self._mirror is None else self._mirror.turned_back(rows, residual)
+
 
 def _groups(model: RobotModel) -> list[str]:
     """Groups of a robot's observation, in order."""

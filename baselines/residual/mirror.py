@@ -3,7 +3,8 @@
 A robot that is its own mirror image needs one answer for both of its steps. A residual that always sees the step on
 the left foot has half as much to learn, and learns it from twice as many steps. In the mirror left and right change
 places; vectors change their y, axes of rotation their x and z, and a share of the load or the choice of a foot, p,
-becomes 1 − p [Abdolhosseini2019].
+becomes 1 − p [Abdolhosseini2019]. What is decided in the mirror is turned back: the ZMP to the left becomes one to the
+right.
 
 [Abdolhosseini2019] F. Abdolhosseini et al., "On Learning Symmetric Locomotion", Motion, Interaction and Games.
 """
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from baselines.compensation.inputs import INPUTS
 from baselines.residual.correction import Corrected
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signal
@@ -55,7 +57,7 @@ class LeftFirst:
     Args:
         signals: The features, earlier measurements left out.
         measured: The measurements of one earlier decision.
-        corrected: The base and its correction, which is the same in the mirror.
+        corrected: The base and what acts on it.
 
     Raises:
         ConfigurationError: No walker, a signal without a mirror image, or a joint corrected unlike the other leg's.
@@ -67,17 +69,20 @@ class LeftFirst:
             raise ConfigurationError(
                 f"mirror is for a walker, whose legs are mirror images, got a {type(model).__name__}; set mirror: false"
             )
-        scale = np.zeros(len(model.joint_names))
-        scale[corrected.joints] = settings.scales(model.joint_names)
+        bounds = corrected.channels.parts(corrected.channels.bounds)
         unlike = [
-            name for name, *pair in zip(model.joint_names, *np.split(scale, 2), strict=False) if np.ptp(pair) > 0.0
+            joint
+            for name, of_input in bounds.items()
+            if INPUTS[name].axes is None
+            for joint, *pair in zip(model.joint_names, *np.split(of_input, 2), strict=False)
+            if np.ptp(pair) > 0.0
         ]
         if unlike:
             raise ConfigurationError(
-                f"mirror needs joints and scale that are the same on both legs, they are not for {', '.join(unlike)}; "
+                f"mirror needs joints and bounds that are the same on both legs, they are not for {', '.join(unlike)}; "
                 "name joints without l_ and r_, or mirror: false"
             )
-        self._now, self._past = Mirror(signals), Mirror(measured)
+        self._now, self._past, self._residual = Mirror(signals), Mirror(measured), Mirror(corrected.channels.signals)
         self._split, self._earlier = len(signals), (settings.history, len(measured))
         self._support = model.observation_table.columns("clock.support")
 
@@ -94,6 +99,10 @@ class LeftFirst:
         now, past = np.split(features, [self._split], axis=1)
         past = self._past(past.reshape(len(past), *self._earlier)).reshape(past.shape)
         return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
+
+    def turned_back(self, rows: Array, residual: Array) -> Array:
+        """A residual as it acts, (num_worlds, k): what was decided in the mirror is its mirror image."""
+        return np.where(rows[:, self._support] == 1.0, self._residual(residual), residual)
 
 
 def _other_side(name: str) -> str:

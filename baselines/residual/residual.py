@@ -12,10 +12,11 @@ from pydantic import ConfigDict, Field, field_validator
 from safetensors.numpy import save
 
 from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
-from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.residual.correction import Corrected
 from baselines.residual.evidence import caution
 from baselines.residual.features import Features
 from baselines.residual.network import Network, Tensors
+from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
 from elastic_env.core.config_problems import ModelError
 from elastic_env.core.errors import ConfigurationError
@@ -139,7 +140,7 @@ class ResidualPolicy:
             _, _, past, known = np.split(memory, self._ends, axis=1)
             features, past = self._features.at(rows, past, fresh, inner, episode_start)
             trust, known = self._caution.observe(rows, np.where(fresh[:, None], self._caution.begin(len(rows)), known))
-            decided = self._network(features[due]) * trust[due]
+            decided = self._features.turned_back(rows[due], self._network(features[due])) * trust[due]
             memory[due] = np.hstack([np.zeros((len(due), 1)), decided, past[due], known[due]])
         residual = memory[:, self._ends[0] : self._ends[1]]
         action, inner = self.corrected.act(observation, residual, inner, episode_start)

@@ -7,6 +7,9 @@ r"""The walking controller: foot force difference control, and feedback of the c
 * Dry friction of the joints that the plan moves is wound against likewise, F/K in the direction of the planned rate;
   F is what an identification found.
 
+Inputs (`baselines.compensation.inputs`) shift the plan's ZMP or center of mass (`baselines.walking.zmp_shift`), add to
+the leg length difference, turn the hips, and change the gains. Feedback then refers to the shifted plan.
+
 All are offsets of the joints around the planned walk. Where a joint is, it takes from the encoder columns of the
 observation, so that an output compensator around it (`baselines.Compensated`) shows it links instead of motors.
 
@@ -21,7 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.policy import Action, ObservationView, taken_up
+from baselines.compensation.inputs import PolicyInputs, shifted_share
+from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
+from baselines.walking.posture import hip_offsets
+from baselines.walking.zmp_shift import center_of_mass_following, center_of_mass_per_pelvis, pelvis_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.biped import Biped
@@ -73,10 +79,11 @@ def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
     return LocalFrame((R @ com[..., None])[..., 0], soles @ R.swapaxes(-1, -2))
 
 
-class WalkingController:
+class WalkingController(PolicyWithInputs):
     """Commands a walker around its plan, see the module.
 
-    Memory per world: steps, leg length difference, COM from both soles, deviation of its velocity, ZMP shift, weight.
+    Memory per world: steps, leg length difference, COM from both soles, deviation of its velocity, ZMP shift,
+    shift of the planned COM for the input `zmp` and in all, weight.
 
     Args:
         model: Assumed walker.
@@ -106,42 +113,55 @@ class WalkingController:
         stiffness = model.stiffness.reshape(2, 6)
         self._ankle_stiffness = stiffness[:, 4:]
         self._weight_of_feet = self._biped.weight - self._biped.chains_above_feet.mass * self._biped.gravity
+        self._per_pelvis = center_of_mass_per_pelvis(model)
         self._friction_deflection = model.coulomb_friction / model.stiffness
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Offsets of the twelve joints [rad], and new state."""
-        return self.predict_winding(observation, None, state, episode_start, deterministic)
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """See `PolicyWithInputs`."""
+        return ("zmp", "com", "leg_length", "hip", "balance_gain")
 
-    def predict_winding(
+    def predict_with(
         self,
         observation: Array,
-        correction: Array | None,
+        inputs: PolicyInputs,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,  # noqa: ARG002
     ) -> tuple[Action, Any]:
-        """`predict` with springs that are wound by 1 + r times as much; r as `baselines.Compensated` has it."""
+        """Offsets of the twelve joints [rad], and new state.
+
+        A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as much.
+        """
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        steps, z, last, velocity, shift, weight = np.split(memory, [1, 2, 6, 8, 10], axis=1)
+        steps, z, last, velocity, shift, planned, weight = np.split(memory, [1, 2, 6, 8, 10, 14], axis=1)
         steps = steps + 1.0
         share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)
         row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
         if self._gains.weight_filter_s is not None:
             load = self._vertical_forces(rows).sum(axis=1, keepdims=True) + self._weight_of_feet
             weight = weight + _share(self._dt, self._gains.weight_filter_s) * (load - weight)
-        z = self._leg_difference(rows, row, z, weight)
-        coms = frame.com_from_soles[..., :2]
+        z = self._leg_difference(rows, row, z, weight, inputs)
+        coms, before = frame.com_from_soles[..., :2], planned[:, 2:]
+        planned = self._planned_shift(inputs, planned, share)
         if self._com_feedback:
-            velocity, shift = self._zmp_shift(rows, row, coms, last.reshape(coms.shape), velocity, shift)
+            seen = coms - planned[:, None, 2:], last.reshape(coms.shape) - before[:, None]
+            velocity, shift = self._zmp_shift(rows, row, seen, (velocity, shift), inputs.balance_gain)
         at_ankles, against_friction = self._ankle_offsets(rows, shift), self._friction_offsets(rows)
-        if correction is not None:
-            at_ankles, against_friction = (1.0 + correction) * at_ankles, (1.0 + correction) * against_friction
-        action = share * (self._leg_offsets(rows, z) + at_ankles) + against_friction
-        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, weight])
+        if inputs.deflection is not None:
+            wound = 1.0 + inputs.deflection
+            at_ankles, against_friction = wound * at_ankles, wound * against_friction
+        lengthened = z if inputs.leg_length is None else z + inputs.leg_length
+        moved = self._leg_offsets(rows, lengthened) + at_ankles
+        if inputs.hip is not None:
+            moved = moved + hip_offsets(inputs.hip, rows[:, self._share][:, 0])
+        action = share * moved + against_friction
+        if planned.any():
+            coming = np.minimum(row + 1, self._plan.num_steps)
+            action = action + pelvis_shift_offsets(self._model, coming, planned[:, 2:] / self._per_pelvis)
+        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, planned, weight])
         action = action.astype(np.float32)
         return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
 
@@ -152,16 +172,27 @@ class WalkingController:
 
     def _begin(self, frame: LocalFrame) -> Array:
         coms = frame.com_from_soles[..., :2].reshape(len(frame.com), 4)
-        zero = np.zeros((len(coms), 1))
-        return np.hstack([zero, zero, coms, zero, zero, zero, zero, zero + self._biped.weight])
+        weight = np.full((len(coms), 1), self._biped.weight)
+        return np.hstack([np.zeros((len(coms), 2)), coms, np.zeros((len(coms), 8)), weight])
 
-    def _leg_difference(self, rows: Array, row: IntArray, z: Array, weight: Array) -> Array:
+    def _planned_shift(self, inputs: PolicyInputs, planned: Array, share: Array) -> Array:
+        """Shift of the planned center of mass for the input `zmp`, and in all on the ramp, (num_worlds, 4) [m]."""
+        following = planned[:, :2]
+        if inputs.zmp is not None:
+            following = center_of_mass_following(following, inputs.zmp, self._plan.omega, self._dt)
+        return np.hstack([following, share * (following if inputs.com is None else following + inputs.com)])
+
+    def _leg_difference(self, rows: Array, row: IntArray, z: Array, weight: Array, inputs: PolicyInputs) -> Array:
         """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
-        gains = self._gains
+        gains, share, gain = self._gains, self._plan.share[row, None], self._gains.force_difference
+        if inputs.zmp_shift is not None:
+            share = shifted_share(share, inputs.zmp_shift[:, 1:], self._biped.foot_spacing)
+        if inputs.balance_gain is not None:
+            gain = (1.0 + inputs.balance_gain) * gain
         vertical = self._vertical_forces(rows)
-        desired = (1.0 - 2.0 * self._plan.share[row, None]) * weight
+        desired = (1.0 - 2.0 * share) * weight
         missing = desired - (vertical[:, [LEFT]] - vertical[:, [RIGHT]])
-        z = z + self._dt * (gains.force_difference * missing - z / gains.force_difference_decay_s)
+        z = z + self._dt * (gain * missing - z / gains.force_difference_decay_s)
         return np.clip(z, -gains.force_difference_limit_m, gains.force_difference_limit_m)
 
     def _vertical_forces(self, rows: Array) -> Array:
@@ -169,16 +200,26 @@ class WalkingController:
         return rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2]
 
     def _zmp_shift(
-        self, rows: Array, row: IntArray, coms: Array, last: Array, velocity: Array, shift: Array
+        self, rows: Array, row: IntArray, coms: tuple[Array, Array], kept: tuple[Array, Array], change: Array | None
     ) -> tuple[Array, Array]:
-        """Filtered deviation of the COM velocity from the plan, and ZMP shift, (num_worlds, 2) each [m/s], [m]."""
-        gains, plan = self._gains, self._plan
+        """Filtered deviation of the COM velocity from the plan, and ZMP shift, (num_worlds, 2) each [m/s], [m].
+
+        Args:
+            rows: Observations.
+            row: Row of the plan.
+            coms: COM from both soles less the shift of the plan, now and a period ago, (num_worlds, 2, 2) each [m].
+            kept: What this returned a period ago.
+            change: Relative change of the gain, (num_worlds, 1) [1].
+        """
+        gains, plan, (now, last), (velocity, shift) = self._gains, self._plan, coms, kept
         worlds, support = np.arange(len(rows)), rows[:, self._clock][:, 2].astype(np.int64)
-        deviation = coms[worlds, support] + self._biped.footholds[support] - plan.com[row]
-        change = (coms - last)[worlds, support] / self._dt - plan.com_dot[row]
-        velocity = velocity + _share(self._dt, gains.velocity_filter_s) * (change - velocity)
-        error = deviation + velocity / plan.omega
-        wanted = np.clip(gains.dcm * error, -gains.zmp_limit_m, gains.zmp_limit_m)
+        deviation = now[worlds, support] + self._biped.footholds[support] - plan.com[row]
+        deviating = (now - last)[worlds, support] / self._dt - plan.com_dot[row]
+        velocity = velocity + _share(self._dt, gains.velocity_filter_s) * (deviating - velocity)
+        error, dcm = deviation + velocity / plan.omega, gains.dcm
+        if change is not None:
+            dcm = (1.0 + change) * dcm
+        wanted = np.clip(dcm * error, -gains.zmp_limit_m, gains.zmp_limit_m)
         return velocity, shift + _share(self._dt, gains.zmp_filter_s) * (wanted - shift)
 
     def _leg_offsets(self, rows: Array, z: Array) -> Array:

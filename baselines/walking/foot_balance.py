@@ -28,6 +28,7 @@ import numpy as np
 
 from baselines.compensation.policy import Action, ObservationView, taken_up
 from baselines.compensation.startup import Ramp
+from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.contact_force import shares
@@ -35,9 +36,6 @@ from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles, rotation_
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.motion.walk_plan import derivatives
 from elastic_env.runtime.robot_model import WalkerModel
-
-_REACH = 0.999
-"""Share of the straight leg's length to which a foot may go."""
 
 
 class FootBalanceGains(Model):
@@ -126,9 +124,7 @@ class FootBalance:
         position, R = foot_pose(leg, q.reshape(-1, 2, 6))
         turned = rotation_of_tilt(turn) @ R
         ankle = position + shift + up * (turned[..., 2] - R[..., 2])
-        distance = np.linalg.norm(ankle, axis=-1, keepdims=True)
-        ankle *= np.minimum(1.0, _REACH * leg.reach / distance)
-        return leg_angles(leg, ankle, turned).reshape(q.shape)
+        return leg_angles(leg, within_reach(leg, ankle), turned).reshape(q.shape)
 
     def _share(self, cutoff_hz: float) -> float:
         """Share of a step that the low-pass makes in one period."""

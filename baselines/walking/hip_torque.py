@@ -20,8 +20,16 @@ from typing import Any
 
 import numpy as np
 
+from baselines.compensation.inputs import PolicyInputs, inputs_of
 from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
-from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from baselines.compensation.policy import (
+    Action,
+    ObservationView,
+    Policy,
+    PolicyWithInputs,
+    predicted,
+    taken_up,
+)
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import WalkerModel
@@ -50,7 +58,7 @@ def limited_in_rate(before: Array, value: Array, rate: float, period_s: float) -
     return before + np.clip(value - before, -rate * period_s, rate * period_s)
 
 
-class HipTorque:
+class HipTorque(PolicyWithInputs):
     """Any policy of a walker with its hip rolls led by their measured torque, see the module.
 
     Memory per world: filtered torques and offsets of the two hip rolls.
@@ -72,16 +80,26 @@ class HipTorque:
         self._torque = table.group(TORQUE_SENSOR)
         self._stiffness = model.stiffness[_HIP_ROLLS]
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Those of the policy inside it."""
+        return inputs_of(self._policy)[1:]
+
+    def predict_with(
+        self,
+        observation: Array,
+        inputs: PolicyInputs,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """Action and new state."""
+        """Action and new state; all inputs are passed on."""
         rows, gains = self._view.rows(observation), self._gains
         measured = rows[:, self._torque][:, _HIP_ROLLS]
         memory, inner = taken_up(
             state, episode_start, rows, self._view, lambda: np.hstack([measured, np.zeros_like(measured)])
         )
-        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
+        action, inner = predicted(self._policy, observation, inputs, inner, episode_start, deterministic)
         torque = filtered(memory[:, :2], measured, gains.cutoff_hz, self._dt)
         wanted = np.clip(torque / self._stiffness, -gains.limit_rad, gains.limit_rad)
         if not gains.in_double_support:

@@ -14,11 +14,13 @@ of this one [Kajita2010, section V].
 [Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from baselines.compensation.policy import Action, Correctable, ObservationView, taken_up
+from baselines.compensation.inputs import PolicyInputs, inputs_of
+from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, predicted, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -40,7 +42,7 @@ class PostureGains(Model):
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
 
-class PostureFeedback(Correctable):
+class PostureFeedback(PolicyWithInputs):
     """Any policy of a walker with its posture held by the hips, see the module.
 
     Memory per world: steps, filtered roll and pitch, their integrals.
@@ -63,34 +65,42 @@ class PostureFeedback(Correctable):
         self._filter = 1.0 - float(np.exp(-self._dt / self._gains.filter_s))
         self._ramp = Ramp(model, ramp_s)
 
-    def predict_corrected(
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """See `PolicyWithInputs`."""
+        return (*inputs_of(self._policy)[1:], "posture_gain")
+
+    def predict_with(
         self,
         observation: Array,
-        correction: Array | None,
+        inputs: PolicyInputs,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Action, Any]:
-        """See `Correctable`; without a correction the policy need not know of any."""
+        """See `PolicyWithInputs`; it takes `posture_gain`."""
         rows = self._view.rows(observation)
         begun = np.zeros((len(rows), 5))
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
-        call = inner, episode_start, deterministic
-        if correction is None:
-            action, inner = self._policy.predict(observation, *call)
-        else:
-            action, inner = self._policy.predict_corrected(observation, correction, *call)
-        turn, memory = self._turned(rows, memory)
+        others = replace(inputs, posture_gain=None)
+        action, inner = predicted(self._policy, observation, others, inner, episode_start, deterministic)
+        turn, memory = self._turned(rows, memory, inputs.posture_gain)
         offsets = hip_offsets(turn, rows[:, self._share][:, 0])
         total = np.asarray(action, dtype=np.float64) + offsets.reshape(np.shape(action))
         return total.astype(np.float32), (memory, inner)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `Correctable`."""
+        """See `PolicyWithInputs`."""
         return self._policy.link_estimate(observation, state[1])
 
-    def _turned(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Turn of both hips against roll and pitch, (num_worlds, 2) [rad], and the new memory."""
+    def _turned(self, rows: Array, memory: Array, change: Array | None) -> tuple[Array, Array]:
+        """Turn of both hips against roll and pitch, (num_worlds, 2) [rad], and the new memory.
+
+        Args:
+            rows: Observations.
+            memory: That of the last step.
+            change: Relative change of all gains, (num_worlds, 1) [1]; the integral itself goes on as it is.
+        """
         gains = self._gains
         steps, tilt, integral = memory[:, :1] + 1.0, memory[:, 1:3], memory[:, 3:5]
         tilt = tilt + self._filter * (rows[:, self._attitude] - tilt)
@@ -98,6 +108,8 @@ class PostureFeedback(Correctable):
         most = gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
         integral = np.clip(integral, -most, most)
         turn = gains.proportional * tilt + gains.integral * integral + gains.derivative * rows[:, self._rate]
+        if change is not None:
+            turn = (1.0 + change) * turn
         turn = self._ramp.share(steps) * np.clip(turn, -gains.limit_rad, gains.limit_rad)
         return turn, np.hstack([steps, tilt, integral])
 

@@ -69,6 +69,11 @@ class Biped:
         return self.hips[:, :2]
 
     @property
+    def foot_spacing(self) -> float:
+        """Distance from the right foothold to the left one [m]."""
+        return float(self.hips[0, 1] - self.hips[1, 1])
+
+    @property
     def ankles(self) -> Array:
         """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
         return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)

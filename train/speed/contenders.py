@@ -10,9 +10,11 @@ import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from baselines.residual.correction import Corrected, ResidualSettings
+from baselines.compensation.inputs import COMMAND, DEFLECTION, inputs_of
+from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual import Network, ResidualDescription, ResidualPolicy
+from baselines.residual.settings import ResidualSettings
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
@@ -223,12 +225,12 @@ class PPOLoop:
 
         where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
         self.title, self.num_envs = f"PPO with {policy}, {where}", num_envs
-        space = "model" if policy not in ("zero", "uncompensated", "uncompensated_open") else "joint"
+        acts_on = COMMAND if policy in ("zero", "uncompensated", "uncompensated_open") else DEFLECTION
         if processes:
-            venv: Any = SubprocVecEnv([_Maker(env, policy, space)] * num_envs, start_method="spawn")
+            venv: Any = SubprocVecEnv([_Maker(env, policy, acts_on)] * num_envs, start_method="spawn")
         else:
             inner = make_vector_env(_condition(env, policy), num_envs, threads, AutoresetMode.SAME_STEP)
-            venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, space=space))
+            venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, {acts_on: None}))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
         self._rollout = max(512 // num_envs, 8)
@@ -250,8 +252,8 @@ class PPOLoop:
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     """A residual with a network of 64×64 as it is before training, small random weights, around a base policy."""
-    space = "model" if hasattr(base, "predict_corrected") else "joint"
-    corrected = Corrected(base, env.unwrapped.assumed_model, ResidualSettings(space=space))
+    acts_on = DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND
+    corrected = Corrected(base, env.unwrapped.assumed_model, ResidualSettings(acts_on={acts_on: None}))
     features, generator = Features(corrected).width, np.random.default_rng(0)
     widths = [features, 64, 64, corrected.num_residuals]
     tensors = {"mean": np.zeros(features), "std": np.ones(features)}
@@ -264,8 +266,8 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
 class _Maker:
     """Makes a scalar environment in a process of its own, with the residual of a base policy around it or without."""
 
-    def __init__(self, env: str, policy: str | None = None, space: str = "model") -> None:
-        self._env, self._policy, self._space = env, policy, space
+    def __init__(self, env: str, policy: str | None = None, acts_on: str = DEFLECTION) -> None:
+        self._env, self._policy, self._acts_on = env, policy, acts_on
 
     def __call__(self) -> Any:
         """The environment."""
@@ -274,7 +276,7 @@ class _Maker:
             return made
         from baselines.residual_env import ResidualWrapper
 
-        return ResidualWrapper(made, self._policy, space=self._space)  # type: ignore[arg-type]
+        return ResidualWrapper(made, self._policy, {self._acts_on: None})
 
 
 def _condition(env: str, policy: str | None) -> Condition:

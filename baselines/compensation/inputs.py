@@ -1,0 +1,135 @@
+"""Named inputs of a base policy: the quantities of its own in which something outside, such as a residual, may act.
+
+Every input has a unit, one column per joint or per axis, and an image in the mirror. Zero gives the base to the last
+bit. An input acts on the quantity that the base itself plans or feeds back, so that its feedback does not work against
+it: a policy that is told to shift its center of mass also expects it there.
+
+Columns per joint are in the order of the robot's joints. Axes: x forward, y to the left.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.signals import Array, Mirrored, Signal
+from elastic_env.runtime.robot_model import RobotModel
+
+COMMAND, DEFLECTION = "command", "deflection"
+
+
+@dataclass(frozen=True)
+class InputKind:
+    """What is known of an input.
+
+    Attributes:
+        unit, meaning: In words.
+        default: Bound where none is given.
+        limit: Every bound must be below it.
+        axes: Columns that are no joints, and what each is in the mirror; none for an input with a column per joint.
+    """
+
+    unit: str
+    meaning: str
+    default: float
+    limit: float
+    axes: Mapping[str, Mirrored] | None = None
+
+    def columns(self, joint_names: list[str]) -> list[str]:
+        """Names of the columns."""
+        return joint_names if self.axes is None else list(self.axes)
+
+
+_PLANE: Mapping[str, Mirrored] = {"x": "same", "y": "opposite"}
+_TILT: Mapping[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
+
+INPUTS: Mapping[str, InputKind] = {
+    COMMAND: InputKind("rad", "offset of the command", default=0.02, limit=1e3),
+    DEFLECTION: InputKind("1", "relative change of the deflection that is compensated", default=0.6, limit=1e3),
+    "zmp": InputKind("m", "shift of the planned ZMP", default=0.02, limit=0.05, axes=_PLANE),
+    "com": InputKind("m", "shift of the planned center of mass", default=0.02, limit=0.05, axes=_PLANE),
+    "leg_length": InputKind(
+        "m", "left less right leg length", default=0.005, limit=0.05, axes={"difference": "opposite"}
+    ),
+    "hip": InputKind("rad", "offset of hip rolls and pitches of legs that stand", default=0.02, limit=0.2, axes=_TILT),
+    "posture_gain": InputKind(
+        "1", "relative change of the posture feedback's gains", default=0.5, limit=1.0, axes={"all": "same"}
+    ),
+    "balance_gain": InputKind(
+        "1", "relative change of the gains of foot forces and center of mass", default=0.5, limit=1.0,
+        axes={"all": "same"},
+    ),
+}  # fmt: skip
+"""All inputs by name. Every policy has `command`; a policy's `inputs` names the others that it has."""
+
+
+def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
+    """The columns of an input as signals, which say what each is in the mirror."""
+    kind = INPUTS[name]
+    if kind.axes is not None:
+        return tuple(Signal(f"{name}.{axis}", kind.unit, kind.meaning, mirrored=m) for axis, m in kind.axes.items())
+    signs: list[Mirrored | None] = ["same"] * len(model.joint_names)  # a relative change has no direction
+    if name == COMMAND:
+        signs = [signal.mirrored for signal in model.observation_table.signals_of("last_command")]
+    named = zip(model.joint_names, signs, strict=True)
+    return tuple(Signal(f"{name}.{joint}", kind.unit, kind.meaning, mirrored=sign) for joint, sign in named)
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyInputs:
+    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is not used.
+
+    A wrapper takes what is its own and passes on the rest. `INPUTS` says what each is. `command` is no field: it is
+    added to whatever a policy commands.
+    """
+
+    deflection: Array | None = None
+    zmp: Array | None = None
+    com: Array | None = None
+    leg_length: Array | None = None
+    hip: Array | None = None
+    posture_gain: Array | None = None
+    balance_gain: Array | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no input is used."""
+        return all(getattr(self, field.name) is None for field in fields(self))
+
+    def with_deflection(self, correction: Array | None) -> "PolicyInputs":
+        """The same with another relative change of the deflection."""
+        return replace(self, deflection=correction)
+
+    @property
+    def zmp_shift(self) -> Array | None:
+        """Where the plan has its ZMP now, less where it had it, (num_worlds, 2) [m]; None where that is not used.
+
+        A center of mass that is shifted for long takes the ZMP along.
+        """
+        if self.zmp is None or self.com is None:
+            return self.com if self.zmp is None else self.zmp
+        return self.zmp + self.com
+
+
+NO_INPUTS = PolicyInputs()
+"""What a policy gets that nothing acts on."""
+
+
+def inputs_of(policy: Any) -> tuple[str, ...]:
+    """Names of the inputs that a policy has."""
+    return (COMMAND, *getattr(policy, "inputs", ()))
+
+
+def shifted_share(share: Array, shift_y: Array, spacing: float) -> Array:
+    """Load share of the right foot under a ZMP that is shifted to the left.
+
+    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot that stands takes
+    over, whose ankle carries the shift, so that the change fades with 4 μ (1 − μ).
+
+    Args:
+        share: Planned share μ, (...).
+        shift_y: Shift p, (...) [m].
+        spacing: Distance w of the feet [m].
+    """
+    return np.clip(share - 4.0 * share * (1.0 - share) * shift_y / spacing, 0.0, 1.0)
