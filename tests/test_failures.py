@@ -2,7 +2,9 @@
 
 import errno
 import io
+import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -61,6 +63,40 @@ def elastic(*arguments: str, **options: object) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, **options)  # type: ignore[call-overload]
 
 
+SEVERAL = """
+import json, resource, sys
+from train.commands.entry import main
+for size, arguments in json.loads(sys.argv[1]):
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
+    sys.argv[1:] = arguments
+    try:
+        main()
+        code = 0
+    except SystemExit as end:
+        code = end.code
+    sys.stderr.write(f"ended with {code}\\n")
+"""
+
+
+def several(*commands: tuple[int | None, list[str]], first: str = "", **options: object) -> list[str]:
+    """What commands say on stderr that all end with the same code, one after the other in one process.
+
+    Args:
+        commands: Largest file that each may write [bytes], None for any, and its arguments.
+        first: Program that goes before them.
+        options: Of `subprocess.run`.
+
+    Returns:
+        Of each command what it said and "ended with CODE".
+    """
+    program = [sys.executable, "-c", first + SEVERAL, json.dumps(commands)]
+    run = subprocess.run(program, capture_output=True, text=True, timeout=120, check=True, **options)  # type: ignore[call-overload]
+    said = [line for line in re.split(r"(?<=ended with \d)\n", run.stderr) if line]
+    assert len(said) == len(commands), run.stderr
+    return said
+
+
 @pytest.mark.parametrize(
     ("error", "said", "code"),
     [
@@ -89,15 +125,16 @@ def test_a_full_disk_is_found_behind_the_error_of_a_library() -> None:
     assert explained(RuntimeError("a defect")) is None
 
 
-@pytest.mark.parametrize("kind", ["raises", "nan", "shape"])
-def test_a_policy_that_fails_is_named_with_scenario_and_step(kind: str, tmp_path: Path) -> None:
+def test_a_policy_that_fails_is_named_with_scenario_and_step(tmp_path: Path) -> None:
     """Catches a traceback, or words that leave open whose policy it was."""
     (tmp_path / "mine.py").write_text(POLICIES)
     reference = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
-    run = elastic("evaluate", "--policy", f"mine.py:{kind}", "--reference", reference, cwd=tmp_path)
-    assert run.returncode == 2, run.stderr
-    assert f"the policy 'mine.py:{kind}' failed in scenario 'nominal', sine, at control step 3" in run.stderr
-    assert "Traceback" not in run.stderr
+    kinds = ["raises", "nan", "shape"]
+    commands = [(None, ["evaluate", "--policy", f"mine.py:{kind}", "--reference", reference]) for kind in kinds]
+    for kind, said in zip(kinds, several(*commands, cwd=tmp_path), strict=True):
+        assert said.endswith("ended with 2"), said
+        assert f"the policy 'mine.py:{kind}' failed in scenario 'nominal', sine, at control step 3" in said
+        assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(
@@ -204,15 +241,15 @@ def limited(size: int) -> Callable[[], None]:
     return limit
 
 
-@pytest.mark.parametrize("size", [0, 100, 2_000, 20_000])
-def test_a_file_that_cannot_grow_is_one_sentence(size: int, tmp_path: Path) -> None:
+def test_a_file_that_cannot_grow_is_one_sentence(tmp_path: Path) -> None:
     """Catches a traceback wherever a comparison writes, and a code that says "worse"."""
     (tmp_path / "cells.yaml").write_text(COMPARISON.replace(', "mine.py:raises"', ""))
     environment = {**os.environ, "MPLCONFIGDIR": str(tmp_path)}
-    run = elastic("compare", "cells.yaml", cwd=tmp_path, preexec_fn=limited(size), env=environment)
-    assert run.returncode == 3, run.stderr
-    assert "File too large" in run.stderr
-    assert "Traceback" not in run.stderr
+    commands = [(size, ["compare", "cells.yaml"]) for size in (0, 100, 2_000, 20_000)]
+    for said in several(*commands, cwd=tmp_path, env=environment):
+        assert said.endswith("ended with 3"), said
+        assert "File too large" in said
+        assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(("video", "said"), [("x.gif", "File too large"), ("x.mp4", "x.mp4 is not whole, 0 of")])
@@ -251,26 +288,21 @@ class Blocked:
         if name.split(".")[0] in ("torch", "stable_baselines3", "imageio", "matplotlib"):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 sys.meta_path.insert(0, Blocked())
-from train.commands.entry import main
-main()
 """
 
 
-@pytest.mark.parametrize(
-    ("arguments", "extra"),
-    [
-        (["train", "train_testbed.yaml"], "train"),
-        (["speed", "--env", "testbed"], "train"),
-        (["export", "x.zip", "train_testbed.yaml"], "train"),
-        (["play", "--video", "x.mp4"], "report"),
-    ],
-)
-def test_an_extra_that_is_not_installed_is_one_sentence(arguments: list[str], extra: str, tmp_path: Path) -> None:
+EXTRAS = [
+    (["train", str(CONFIGS / "train_testbed.yaml")], "train"),
+    (["speed", "--env", "testbed"], "train"),
+    (["export", "x.zip", str(CONFIGS / "train_testbed.yaml")], "train"),
+    (["play", "--video", "x.mp4"], "report"),
+]
+
+
+def test_an_extra_that_is_not_installed_is_one_sentence(tmp_path: Path) -> None:
     """Catches a traceback, of this process or of one that it started before it looked."""
-    given = [str(CONFIGS / name) if name.endswith(".yaml") else name for name in arguments]
-    run = subprocess.run(
-        [sys.executable, "-c", BLOCKED, *given], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert run.returncode == 2, run.stderr
-    assert f"pip install -c constraints.txt '.[{extra}]'" in run.stderr
-    assert "Traceback" not in run.stderr
+    found = several(*[(None, arguments) for arguments, _ in EXTRAS], first=BLOCKED, cwd=tmp_path)
+    for said, (_, extra) in zip(found, EXTRAS, strict=True):
+        assert said.endswith("ended with 2"), said
+        assert f"pip install -c constraints.txt '.[{extra}]'" in said
+        assert "Traceback" not in said

@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from rich.console import Console
 
 import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
@@ -20,8 +19,7 @@ from elastic_env.motion.references import Hold
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.runtime.scenario import make_scenario
 from tests.trees import pendulum
-from train.evaluate.evaluate import Condition, Evaluation, PolicySpec
-from train.experiments.compare import run_conditions
+from train.evaluate.evaluate import Condition, Evaluation, PolicySpec, evaluate
 
 ID = "elastic_env/Testbed-v0"
 G = 60.0  # torque of the pendulum at the horizontal [N·m]
@@ -233,19 +231,30 @@ def test_three_masses_are_refused() -> None:
         identify([gymnasium.make(ID)] * 3)
 
 
-# From here on the simulated testbed: one rollout each, shared by the tests, as many at a time as there are cores.
+# From here on the simulated testbed: one rollout each, shared by the tests.
 
-NARROW = {"kind": "hold", "positions": 5, "lower": -0.6, "upper": 0.5, "rate": 0.2, "shortest_move_s": 3.0}
+NARROW = {
+    "kind": "hold", "positions": 5, "lower": -0.6, "upper": 0.5, "rate": 0.4, "shortest_move_s": 1.2, "settle_s": 0.8,
+    "measure_s": 0.1,
+}  # fmt: skip
+CALM = H54_200_S500_R.replace(damping=60.0)
+"""Comes to rest sooner."""
 WIDE = {"kind": "hold", "positions": 7, "rate": 0.1, "settle_s": 1.0, "measure_s": 0.4}
-ENDS = {**WIDE, "positions": 2, "lower": -0.4, "upper": 0.4}  # compensated, the error is the same all over
+# compensated, the error is the same all over
+ENDS = {**WIDE, "positions": 2, "lower": -0.4, "upper": 0.4, "rate": 0.3, "settle_s": 0.8}
 RUNS: dict[str, dict[str, Any]] = {
     "nominal": {"reference": WIDE, "scenario": "nominal"},
     "backlash": {"reference": WIDE, "scenario": "backlash"},
     "nominal input": {"reference": ENDS, "scenario": "nominal", "policy": "input"},
-    "ideal 300": {"reference": NARROW, "scenario": "ideal", "env_options": {"stiffness": 300.0}},
-    "ideal 1001": {"reference": NARROW, "scenario": "ideal"},
-    "ideal 3000": {"reference": NARROW, "scenario": "ideal", "env_options": {"stiffness": 3000.0}},
-    "ideal input": {"reference": {**NARROW, "positions": 2}, "scenario": "ideal", "policy": "input"},
+    "ideal 300": {"reference": NARROW, "scenario": "ideal", "env_options": {"stiffness": 300.0, "joint": CALM}},
+    "ideal 1001": {"reference": NARROW, "scenario": "ideal", "env_options": {"joint": CALM}},
+    "ideal 3000": {"reference": NARROW, "scenario": "ideal", "env_options": {"stiffness": 3000.0, "joint": CALM}},
+    "ideal input": {
+        "reference": {**NARROW, "positions": 2},
+        "scenario": "ideal",
+        "policy": "input",
+        "env_options": {"joint": CALM},
+    },
 }
 
 
@@ -255,7 +264,7 @@ def runs() -> dict[str, Evaluation]:
     conditions = [
         Condition(**{**run, "policy": PolicySpec(name=run.get("policy", "uncompensated"))}) for run in RUNS.values()
     ]
-    return dict(zip(RUNS, run_conditions(conditions, Console(quiet=True)), strict=True))
+    return {name: evaluate(condition, num_threads=1) for name, condition in zip(RUNS, conditions, strict=True)}
 
 
 def identified(run: Evaluation) -> Identification:
@@ -320,12 +329,10 @@ def test_backlash_biases_the_line_and_not_our_fit(runs: dict[str, Evaluation]) -
 def test_two_masses_find_the_sine_error_of_a_simulated_imu() -> None:
     """Catches loads that are mixed up between recording and regression; a single mass is 3.5 % off here."""
     ideal = make_scenario("ideal")
-    reference = {**NARROW, "rate": 0.4, "shortest_move_s": 1.2, "settle_s": 0.8, "measure_s": 0.1}
     scenario = ideal.replace(imu=ideal.imu.replace(sine_error_rad=2e-3))
     envs = [
         gymnasium.make(
-            ID, reference=reference, scenario=scenario, pendulum=Pendulum().with_mass_scaled(mass),
-            joint=H54_200_S500_R.replace(damping=60.0),  # comes to rest sooner
+            ID, reference=NARROW, scenario=scenario, pendulum=Pendulum().with_mass_scaled(mass), joint=CALM
         )
         for mass in (1.0, 0.5)
     ]  # fmt: skip

@@ -192,8 +192,15 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
         acting(acts_on={"zmp": {"z": 0.01}})
 
 
-@pytest.mark.parametrize(("robot", "base", "space"), BASES[1:5:3] + BASES[6:7])
-@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+@pytest.mark.parametrize(
+    ("robot", "base", "space", "mode"),
+    [  # each mode on both robots, and each space on the walker
+        (*BASES[1], AutoresetMode.SAME_STEP),
+        (*BASES[4], AutoresetMode.NEXT_STEP),
+        (*BASES[6], AutoresetMode.SAME_STEP),
+        (*BASES[6], AutoresetMode.NEXT_STEP),
+    ],
+)
 def test_a_vector_of_worlds_is_the_scalar_wrapper(robot: str, base: str, space: Any, mode: AutoresetMode) -> None:
     """Catches rewards that go on after an end, worlds that begin inside a decision, and memories that are mixed up."""
     further = {"history": 2, "observe": ["observation", "base_action"], "decision_period": 20}

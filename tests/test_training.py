@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -106,20 +107,21 @@ def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     assert (tmp_path / "whole" / "progress.csv").read_bytes() == (tmp_path / "part" / "progress.csv").read_bytes()
 
 
-@pytest.mark.parametrize("file", ["model.pt", "state.json", "state.npz"])
-@pytest.mark.parametrize("size", [None, 0, 100])
-def test_a_damaged_checkpoint_is_named(file: str, size: int | None, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
     """Catches errors of libraries in the place of one that says which files, and what to do."""
     config = TrainConfig(**{**SMALL, **PPO})
     with pytest.raises(KeyboardInterrupt):
-        Training(config, 1, tmp_path).run(interrupted_after(96))
-    damaged = tmp_path / "checkpoint" / file
-    if size is None:
-        damaged.unlink()
-    else:
-        damaged.write_bytes(damaged.read_bytes()[:size])
-    with pytest.raises(ElasticError, match=r"checkpoint is damaged or not whole .*; remove it"):
-        Training(config, 1, tmp_path)
+        Training(config, 1, tmp_path / "whole").run(interrupted_after(96))
+    for file in ("model.pt", "state.json", "state.npz"):
+        for size in (None, 0, 100):
+            folder = Path(shutil.copytree(tmp_path / "whole", tmp_path / f"{file} {size}"))
+            damaged = folder / "checkpoint" / file
+            if size is None:
+                damaged.unlink()
+            else:
+                damaged.write_bytes(damaged.read_bytes()[:size])
+            with pytest.raises(ElasticError, match=r"checkpoint is damaged or not whole .*; remove it"):
+                Training(config, 1, folder)
 
 
 def test_a_killed_training_goes_on(tmp_path: Path) -> None:

@@ -27,7 +27,6 @@ Zero-Phase Filtering: Applications to Robotics", IEEE Trans. Circuits and System
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import signal
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -59,6 +58,8 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
         cutoff_hz: Where the amplitude is halved [Hz].
         period_s: Time between rows [s].
     """
+    from scipy import signal  # here: it takes half a second to load, and most programs need none of it
+
     sections = signal.butter(_ORDER, cutoff_hz, fs=1.0 / period_s, output="sos")
     longest = round(1.0 / (cutoff_hz * period_s))  # a period of the cutoff at both ends
     return signal.sosfiltfilt(sections, table, axis=0, padlen=min(longest, len(table) - 1))

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
 from baselines.identification.static_points import StaticPoints, link_torque, record_points
@@ -182,6 +181,8 @@ def identify_points(points: StaticPoints, gravity: Sequence[GravityModel], seed:
         )
     rows = [np.flatnonzero(points.position == position) for position in positions]
 
+    from scipy import stats  # here: it takes half a second to load, and most programs need none of it
+
     generator = np.random.default_rng(seed)
 
     def statistics(chosen: IntArray) -> tuple[float, float]:
@@ -249,5 +250,7 @@ def _expanded_level(positions: int, level: float = 0.95) -> float:
     The expanded percentile interval of T. Hesterberg, "What Teachers Should Know About the Bootstrap", The American
     Statistician 69(4), 2015: a t quantile and n/(n − 1) in place of the normal quantile.
     """
+    from scipy import stats  # here: it takes half a second to load, and most programs need none of it
+
     quantile = np.sqrt(positions / (positions - 1)) * stats.t.ppf((1.0 + level) / 2.0, positions - 1)
     return float(1.0 - 2.0 * stats.norm.sf(quantile))

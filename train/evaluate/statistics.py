@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from elastic_env.core.signals import Array
 
@@ -97,6 +96,8 @@ def change(scenarios: Sequence[Pairs]) -> float:
 
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
     """Mean of what is left without the lowest and the highest quarter, rounded down in number."""
+    from scipy import stats  # here: it takes half a second to load, and most programs need none of it
+
     return stats.trim_mean(values, _CUT, axis=axis)
 
 
@@ -171,6 +172,8 @@ def improvement(seeds: Sequence[Sequence[Pairs]]) -> Estimate:
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
     """Percentile bootstrap over training seeds; the same samples, sorted, give the same interval."""
+    from scipy import stats  # here: it takes half a second to load, and most programs need none of it
+
     found = stats.bootstrap(
         samples, statistic, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile", paired=True,
         vectorized=True, rng=np.random.default_rng(_BOOTSTRAP_SEED),
