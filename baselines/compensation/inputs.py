@@ -52,7 +52,7 @@ INPUTS: Mapping[str, InputKind] = {
     "leg_length": InputKind(
         "m", "left less right leg length", default=0.005, limit=0.05, axes={"difference": "opposite"}
     ),
-    "hip": InputKind("rad", "offset of hip rolls and pitches of legs that stand", default=0.02, limit=0.2, axes=_TILT),
+    "hip": InputKind("rad", "offset of both hip rolls, of both hip pitches", default=0.02, limit=0.2, axes=_TILT),
     "posture_gain": InputKind(
         "1", "relative change of the posture feedback's gains", default=0.5, limit=1.0, axes={"all": "same"}
     ),
