@@ -74,6 +74,8 @@ def test_a_robot_that_falls_is_worse_off_than_any_other() -> None:
     assert share_better(base, mine, METRIC) == pytest.approx(1.0 - share_better(mine, base, METRIC))
     assert share_better(mine[::-1], base, METRIC) == share_better(mine, base, METRIC)
     assert np.isnan(share_better(mine, records([1.0], first=50), METRIC))
+    without = [{**record, METRIC: float("nan")} for record in records([1.0])]
+    assert share_better(without + records([1.0], first=1), records([2.0, 2.0]), METRIC) == 1.0
 
 
 # Cells.

@@ -119,7 +119,8 @@ def worst_share_mean(values: Array, share: float = WORST) -> float:
 def share_better(mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]], metric: str) -> float:
     """Share of the episodes of both in which the policy is better (lower) than the base; ties count half.
 
-    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode in common.
+    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode in common. An
+    episode that reached its end without a figure, such as a ZMP of feet that never carried anything, is left out.
 
     Args:
         mine: Records of episodes in one cell, with `seed`, `termination` and the metric.
@@ -128,8 +129,9 @@ def share_better(mine: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, 
     """
     ours, theirs = _by_seed(mine), _by_seed(base)
     found = [(_ranked(ours[seed], metric), _ranked(theirs[seed], metric)) for seed in sorted(ours.keys() & theirs)]
-    values = np.array(found, dtype=np.float64).reshape(-1, 2)
-    return _wins(Pairs(values[:, 0], values[:, 1])) / len(found) if found else float("nan")
+    known = [both for both in found if not np.isnan(both).any()]
+    values = np.array(known, dtype=np.float64).reshape(-1, 2)
+    return _wins(Pairs(values[:, 0], values[:, 1])) / len(known) if known else float("nan")
 
 
 def over_seeds(values: Sequence[float]) -> Estimate:
