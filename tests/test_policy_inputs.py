@@ -175,6 +175,25 @@ def test_two_feet_share_a_shifted_zmp_by_the_lever() -> None:
     np.testing.assert_array_equal(shifted_share(np.array([0.01]), np.array([0.05]), spacing) >= 0.0, [True])
 
 
+def test_the_force_difference_control_wants_the_shifted_loads() -> None:
+    """A ZMP p to the left loads the left foot by 2 p/w of the weight more; a step integrates that to a leg length."""
+    env = walker()
+    observation, _ = env.reset(seed=0)
+    biped, gain, shift = model_of(env).biped, 8e-4, 0.005
+
+    def action(force_difference: float, **values: Array) -> Array:
+        gains = {"force_difference": force_difference, "dcm": 0.0}
+        policy: Any = baselines.make("uncompensated", env, gains=gains, ramp_s=0.004)
+        return policy.predict_with(observation, PolicyInputs(**values))[0].astype(np.float64)
+
+    zmp = np.array([[0.0, shift]])
+    found = (action(gain, zmp=zmp) - action(0.0, zmp=zmp)) - (action(gain) - action(0.0))
+    longer = 0.004 * gain * 2.0 * shift / biped.foot_spacing * biped.weight
+    expected = action(0.0, leg_length=np.array([[longer]])) - action(0.0)
+    assert np.abs(expected).max() > 1e-5
+    np.testing.assert_allclose(found, expected, atol=1e-8, rtol=2e-3)
+
+
 SIGNS = {
     "command.l_hip_roll": ("command.r_hip_roll", -1), "command.l_knee": ("command.r_knee", 1),
     "deflection.l_hip_roll": ("deflection.r_hip_roll", 1), "zmp.x": ("zmp.x", 1), "zmp.y": ("zmp.y", -1),

@@ -86,7 +86,8 @@ def pelvis_shift_offsets(model: WalkerModel, row: IntArray | slice, shift: Array
         (rows, 12) [rad].
     """
     plan, biped = model.plan, model.biped
-    pelvis = plan.pelvis[row] + np.pad(shift, ((0, 0), (0, 1)))
+    pelvis = np.array(plan.pelvis[row])
+    pelvis[:, :2] += shift
     target = within_reach(biped.leg, plan.ankles[row] - pelvis[:, None] - biped.hips)
     level = np.broadcast_to(np.eye(3), (*target.shape, 3))
     q = leg_angles(biped.leg, target, level).reshape(len(shift), -1)
