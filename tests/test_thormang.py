@@ -100,6 +100,11 @@ def test_options_change_what_they_say() -> None:
     assert twin["l_hip_roll"].stiffness == 1001.0
     assert twin["r_knee"].servo is not None
     assert twin["r_knee"].servo.torque_limit == 168.0
+    loaded = held(Thormang(torso_load_kg=5.0))
+    load, torso = loaded.body("load"), loaded.body("upper_body")
+    assert load.mass[0] == 5.0
+    np.testing.assert_allclose(load.pos + load.ipos, 2.0 * torso.ipos)  # on the shoulders
+    assert load.pos[2] + load.ipos[2] == pytest.approx(0.319)
 
 
 def test_elastic_robot_compiles_with_rotors_and_servos() -> None:

@@ -52,7 +52,7 @@ class Thormang(Model):
     twin_knee: bool = False
     """Whether two servos share each knee: twice its stiffness, damping, rotor inertia, friction and torque."""
     friction: float = quantity("1", 1.0, gt=0, description="friction of the soles on the floor")
-    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="mass carried in the middle of the upper body")
+    torso_load_kg: float = quantity("kg", 0.0, ge=0, description="mass carried on the shoulders")
 
     @property
     def joints(self) -> dict[str, ElasticJoint]:
@@ -120,7 +120,8 @@ def rigid_spec(robot: Thormang, floating: bool = True) -> mujoco.MjSpec:
     if robot.torso_load_kg > 0.0:
         torso, load = bodies[_TORSO], robot.torso_load_kg
         inertia = [load * _LOAD_GYRATION_M**2] * 3
-        torso.add_body(name="load", pos=torso.ipos, mass=load, inertia=inertia, explicitinertial=True)
+        # 0.16 m above the center of mass of the torso, which is itself 0.16 m above its frame
+        torso.add_body(name="load", pos=torso.ipos, ipos=torso.ipos, mass=load, inertia=inertia, explicitinertial=True)
     for side in SIDES:
         _add_sole(bodies[f"{side}_foot"], side, robot.friction)
     bodies["pelvis"].add_site(name="imu")
