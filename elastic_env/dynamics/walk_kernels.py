@@ -85,7 +85,8 @@ def begin(physics: Any, walker: Any, noise: Any, worlds: BoolArray, rows: Any) -
                 settle_imu(truth, drawn, bias, constants.quality, shown)
             imu_is_due = row_of(walker.plan, truth.step).imu_is_due  # as always at first
             measure(truth, drawn, bias, constants.quality, imu_is_due, shown)
-            shown.encoder_before[:] = shown.encoder
+            for i in range(len(shown.encoder)):
+                shown.encoder_before[i] = shown.encoder[i]
 
 
 @compiled
@@ -450,12 +451,13 @@ def observe(row: Any, shown: Any, coming: Any, period_s: float, observed: Any) -
         observed.encoder_rate[i] = (shown.encoder[i] - shown.encoder_before[i]) / period_s
         observed.reference_angle[i], observed.reference_rate[i] = coming.q[i], coming.q_dot[i]
         observed.reference_acceleration[i], observed.last_command[i] = coming.q_ddot[i], row.command[i]
-    observed.imu_attitude[:], observed.imu_rate[:], observed.wrench[:] = (
-        shown.imu_attitude,
-        shown.imu_rate,
-        shown.wrench,
-    )
-    observed.clock[:], observed.load_share, observed.zmp_reference[:] = coming.clock, coming.share, coming.zmp
+    observed.load_share = coming.share
+    for i in range(2):
+        observed.imu_attitude[i], observed.zmp_reference[i] = shown.imu_attitude[i], coming.zmp[i]
+    for i in range(3):
+        observed.imu_rate[i], observed.clock[i] = shown.imu_rate[i], coming.clock[i]
+        for foot in range(2):
+            observed.wrench[foot, 0, i], observed.wrench[foot, 1, i] = shown.wrench[foot, 0, i], shown.wrench[foot, 1, i]
 
 
 @compiled
