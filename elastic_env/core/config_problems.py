@@ -1,5 +1,6 @@
 """What is wrong with the parameters of a model, in sentences that name each as its user wrote it."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -46,7 +47,8 @@ class Problem:
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
 
 
-_MOST_SAID = 20
+_MOST_SAID, _LONGEST_SAID = 20, 1900
+"""Problems and characters, after which an error says how many more problems there are."""
 
 
 def dotted(path: ParameterPath) -> str:
@@ -73,8 +75,11 @@ class ModelError(ConfigurationError):
     def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
         """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
         sentences = list(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
-        more = [f"and {len(sentences) - _MOST_SAID} more"] if len(sentences) > _MOST_SAID else []
-        return "\n".join([*sentences[:_MOST_SAID], *more])
+        lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
+        fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
+        said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]
+        more = [f"and {len(sentences) - len(said)} more"] if len(said) < len(sentences) else []
+        return "\n".join([*said, *more])
 
 
 def problems_of(model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]) -> list[Problem]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, within_compiled
 from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
 
 FIRST_HALF, SECOND_HALF = 1, 2
@@ -250,7 +250,9 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
             return
         for i, angle in enumerate((row.roll, row.pitch)):
             drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
-            shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], drawn, quality)
+            shown.imu_attitude[i] = shown_angle(
+                angle, bias.imu_attitude[i], drawn, quality.imu_bias_rad, quality.imu_sine_error_rad
+            )
         for i in range(3):
             shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
 
@@ -260,7 +262,9 @@ def show_inertial(bias: Any, quality: Any, shown: Any) -> None:
     """What an inertial IMU shows of its own state: noise is in it, errors of the mounting come on top."""
     roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
     for i, angle in enumerate((roll, pitch)):
-        shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], 0.0, quality)
+        shown.imu_attitude[i] = shown_angle(
+            angle, bias.imu_attitude[i], 0.0, quality.imu_bias_rad, quality.imu_sine_error_rad
+        )
     for i in range(3):
         shown.imu_rate[i] = shown.imu_gyro[i]
 
@@ -375,17 +379,16 @@ def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, flo
     return y * other[2] - z * other[1], z * other[0] - x * other[2], x * other[1] - y * other[0]
 
 
-@compiled
-def in_whole_counts(angle: float, count_rad: float) -> float:
+@within_compiled
+def in_whole_counts(angle: Any, count_rad: float) -> Any:
     """The nearest whole counts of an encoder, as an angle [rad]; counts of 0 leave it as it is."""
     return np.rint(angle / count_rad) * count_rad if count_rad > 0.0 else angle
 
 
-@compiled
-def shown_angle(angle: float, drawn_bias: float, noise: float, quality: Any) -> float:
+@within_compiled
+def shown_angle(angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float) -> Any:
     """An angle by the IMU, see `elastic_env.runtime.sensors.attitude` [rad]."""
-    constant = quality.imu_bias_rad + quality.imu_sine_error_rad * np.sin(angle)
-    return angle + drawn_bias + noise + constant
+    return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
 
 
 @compiled
@@ -457,7 +460,10 @@ def observe(row: Any, shown: Any, coming: Any, period_s: float, observed: Any) -
     for i in range(3):
         observed.imu_rate[i], observed.clock[i] = shown.imu_rate[i], coming.clock[i]
         for foot in range(2):
-            observed.wrench[foot, 0, i], observed.wrench[foot, 1, i] = shown.wrench[foot, 0, i], shown.wrench[foot, 1, i]
+            observed.wrench[foot, 0, i], observed.wrench[foot, 1, i] = (
+                shown.wrench[foot, 0, i],
+                shown.wrench[foot, 1, i],
+            )
 
 
 @compiled
