@@ -114,12 +114,11 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             return Problem(path, "rule", str(problem["ctx"]["error"]))
         case "model_type":
             return Problem(path, "must", f"must be a mapping of parameters, got {given}")
-        case "too_short":
-            least = problem["ctx"]["min_length"]
-            return Problem(path, "must", f"must have at least {least} {_entries(least)}, got {given}")
-        case "too_long":
-            most = problem["ctx"]["max_length"]
-            return Problem(path, "must", f"must have at most {most} {_entries(most)}, got {given}")
+        case "too_short" | "too_long" as kind:
+            bound, key = ("least", "min_length") if kind == "too_short" else ("most", "max_length")
+            number = problem["ctx"][key]
+            entries = "entry" if number == 1 else "entries"
+            return Problem(path, "must", f"must have at {bound} {number} {entries}, got {given}")
         case "string_too_long":
             return Problem(path, "must", f"must have at most {problem['ctx']['max_length']} characters, got {given}")
         case "string_pattern_mismatch":
@@ -134,10 +133,6 @@ _KINDS = {
     "bool_type": "true or false", "bool_parsing": "true or false",
 }  # fmt: skip
 """What a parameter must be, where Pydantic's words are not those of a configuration."""
-
-
-def _entries(number: int) -> str:
-    return "entry" if number == 1 else "entries"
 
 
 def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:

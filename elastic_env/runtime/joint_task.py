@@ -346,7 +346,10 @@ class JointTask(Stateful):
             "servo_error": sample.servo_error,
             "command_rate": sample.command_rate,
         }
-        shown = _of_one(of_joints) if len(self._joints) == 1 else self._of_several(of_joints)
+        if len(self._joints) == 1:
+            shown = {name: values[:, 0].copy() for name, values in of_joints.items()}
+        else:
+            shown = self._of_several(of_joints)
         return {"time_s": sample.step * self.config.control_period_s, **shown, "rest": sample.rest.copy()}
 
     def _of_several(self, of_joints: dict[str, Array]) -> Signals:
@@ -433,8 +436,3 @@ class JointTask(Stateful):
             imu=np.where(due[:, None], attitude(scenario.imu, self._state.q, self._imu_bias, noise), last.imu),
         )
         return fresh if worlds.all() else last.with_worlds(worlds, fresh)
-
-
-def _of_one(of_joints: dict[str, Array]) -> Signals:
-    """The signals of the only joint."""
-    return {name: values[:, 0].copy() for name, values in of_joints.items()}
