@@ -218,7 +218,7 @@ class PPOLoop(Contender):
         else:
             inner = make_vector_env(_condition(env, policy), num_envs, threads, AutoresetMode.SAME_STEP)
             venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, space=space))
-        self.env, self._period = venv, ResidualSettings().decision_period
+        self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
         self._rollout = max(512 // num_envs, 8)
         self._model = PPO(
@@ -226,6 +226,7 @@ class PPOLoop(Contender):
             policy_kwargs={"net_arch": [64, 64]},
         )  # fmt: skip
         self._model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
+        self.env = self._model.get_env()
 
     def run(self, steps: int) -> float:  # noqa: ARG002  a whole iteration is the least there is
         """See `Contender`: one iteration of 512 decisions."""
