@@ -7,6 +7,7 @@ shows it compensated encoder readings. The named policies are such compositions.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
@@ -15,7 +16,7 @@ from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
-from baselines.compensation.compensators import DynamicCompensator, GravityCompensator, OutputMethod
+from baselines.compensation.compensators import Compensator, DynamicCompensator, GravityCompensator, OutputMethod
 from baselines.compensation.measured import LINK_ENCODER, TORQUE_SENSOR, DeflectionSensors, MeasuredCompensator
 from baselines.compensation.oracle import Oracle
 from baselines.compensation.policy import Policy, Zero
@@ -30,7 +31,6 @@ from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 Builder = Callable[[Any, Any, PolicyOptions], Any]
 """Builds a policy for an environment, an assumed model and options."""
-Compensating = type[GravityCompensator] | type[DynamicCompensator]
 
 
 class Track(StrEnum):
@@ -65,7 +65,7 @@ def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noq
     return Zero(model.observation_table)
 
 
-def _around_zero(compensator: Compensating) -> Builder:
+def _around_zero(compensator: Callable[..., Compensator]) -> Builder:
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
         made = compensator(model, options.output or "taylor", options.gravity)
         return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
@@ -73,9 +73,7 @@ def _around_zero(compensator: Compensating) -> Builder:
     return build
 
 
-def _friction(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-    made = DynamicCompensator(model, options.output or "taylor", options.gravity, friction=True)
-    return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
+_friction = _around_zero(partial(DynamicCompensator, friction=True))
 
 
 def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
@@ -87,7 +85,7 @@ def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
     return WalkingController(model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s)
 
 
-def _around_controller(compensator: Compensating, output: OutputMethod) -> Builder:
+def _around_controller(compensator: Callable[..., Compensator], output: OutputMethod) -> Builder:
     def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
         made = compensator(model, options.output or output, options.gravity)
         return Compensated(_controller(env, model, options), made, ramp_s=options.ramp_s)
@@ -120,11 +118,7 @@ def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 def _weighing(build: Builder) -> Builder:
     """With a controller that measures the robot's weight, unless its gains are given."""
-
-    def build_weighing(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        return build(env, model, options if options.gains else options.replace(gains=_WEIGHING))
-
-    return build_weighing
+    return lambda env, model, options: build(env, model, options if options.gains else options.replace(gains=_WEIGHING))
 
 
 def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -132,10 +126,9 @@ def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _with_posture(build: Builder) -> Builder:
-    def build_with_posture(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        return PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
-
-    return build_with_posture
+    return lambda env, model, options: PostureFeedback(
+        build(env, model, options), model, options.posture, options.ramp_s
+    )
 
 
 def learned_base(options: PolicyOptions, is_walker: bool) -> str:
@@ -189,10 +182,9 @@ COMPENSATED: Mapping[str, Builder] = {
 }
 """Compensated policies of a walker, which a feedback can build on."""
 
-_ASSUMED = ("stiffness", "stiffness_scale")
-ASSUMED_OPTIONS = _ASSUMED
+ASSUMED_OPTIONS = ("stiffness", "stiffness_scale")
 """Options that say what a policy assumes of the joints."""
-_COMPENSATOR = (*_ASSUMED, "output", "gravity", "ramp_s")
+_COMPENSATOR = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
 _CONTROLLER = ("gains", "com_feedback")
 _COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
 _MEASURED = (*_COMPENSATED, "adaptation")
@@ -214,8 +206,8 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
 
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
-    "uncompensated_open": NamedPolicy(_open(_controller), (*_ASSUMED, "gains", "ramp_s")),
-    "uncompensated": NamedPolicy(_controller, (*_ASSUMED, *_CONTROLLER, "ramp_s")),
+    "uncompensated_open": NamedPolicy(_open(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),
+    "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER, "ramp_s")),
     "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
     "adaptive": NamedPolicy(_weighing(_adaptive), (*_COMPENSATED, "base", "adaptation")),
@@ -232,7 +224,7 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "link_encoder": NamedPolicy(_weighing(_measured(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
     "thormang": NamedPolicy(_thormang, ("stance_roll", "foot_balance", "ramp_s")),
     "talos": NamedPolicy(
-        _talos, (*_ASSUMED, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
+        _talos, (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
     ),
     "iterative": NamedPolicy(_iterative, (*_COMPENSATED, "base", "adaptation", "posture", *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, (*_CONTROLLER, "ramp_s"), Track.TRUTH),

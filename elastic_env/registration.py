@@ -86,7 +86,9 @@ def require_models(**arguments: tuple[Any, type[Any]]) -> None:
     """
     for name, (given, model) in arguments.items():
         if not isinstance(given, dict | model | None):
-            raise ConfigurationError(f"{name} must be a {model.__name__} or a mapping of its parameters, got {given!r}")
+            raise ConfigurationError(
+                f"{name} must be a {model.__name__} or a mapping of its parameters, got {shown(given)}"
+            )
 
 
 def require_memory(name: str, worlds: int, world_bytes: int) -> None:

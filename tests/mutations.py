@@ -176,8 +176,8 @@ def read_residual(folder: Path) -> None:
     try_out(config.conditions())
 
 
-LONGEST_S = 10.0
-"""A case that takes longer is a fault."""
+LONGEST_S, LONGEST_ERROR = 10.0, 2200
+"""A case that takes longer, or an error of more characters, is a fault."""
 
 READERS: dict[str, Callable[[Path], None]] = {"train": read_training, "bench": read_bench, "": read_comparison}
 """What reads the shipped configurations, by the beginning of their names."""
@@ -213,6 +213,9 @@ def main(first: int, count: int) -> int:
             try:
                 outcome = play(number, Path(folder))
                 taken, longest = taken + (outcome == "taken"), max(longest, len(outcome))
+                if len(outcome) > LONGEST_ERROR:
+                    faults += 1
+                    print(f"case {number}: an error of {len(outcome)} characters, {outcome[:200]!r}", flush=True)
             except Exception:
                 faults += 1
                 print(f"case {number}:\n{''.join(traceback.format_exc().splitlines(keepends=True)[-9:])}", flush=True)

@@ -11,9 +11,10 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.estimators import mean_load
 from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
+from baselines.compensation.compensators import PRESLIDING_RAD, presliding_friction
 from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import DeflectionSensors
-from baselines.estimation.joint_stiffness import PRESLIDING_RAD, StiffnessPrior, friction_after, regressed
+from baselines.estimation.joint_stiffness import StiffnessPrior, regressed
 from baselines.policies import sensors_needed
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -58,11 +59,11 @@ def test_joints_without_load_take_after_the_others() -> None:
 def test_friction_turns_round_as_dahl_has_it() -> None:
     """From −F over a displacement s: F (1 − 2 exp(−s/s₀)); many small displacements are one large one."""
     coulomb, s = np.array([5.4]), 2e-3
-    turned = friction_after(-coulomb, np.array([s]), coulomb)
+    turned = presliding_friction(-coulomb, np.array([s]), coulomb)
     np.testing.assert_allclose(turned, coulomb * (1.0 - 2.0 * np.exp(-s / PRESLIDING_RAD)))
     slowly = -coulomb
     for _ in range(20):
-        slowly = friction_after(slowly, np.array([s / 20]), coulomb)
+        slowly = presliding_friction(slowly, np.array([s / 20]), coulomb)
     np.testing.assert_allclose(slowly, turned)
 
 

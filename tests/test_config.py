@@ -258,3 +258,15 @@ def test_every_option_is_documented() -> None:
     assert arguments | keys <= quoted
     first_cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
     assert {name for cell in first_cells for name in re.findall(r"`(\w+)`", cell)} <= arguments | keys
+
+
+MANY = {str(number): number for number in range(2000)}
+
+
+@pytest.mark.parametrize("argument", [{"reward": MANY}, {"reward": [1] * 2000}, {"gait": [1] * 2000}, {"robot": MANY}])
+def test_an_error_is_short_whatever_was_given(argument: dict[str, Any]) -> None:
+    """Catches an error that repeats all of a long list, or names each of two thousand unknown parameters."""
+    with pytest.raises(ConfigurationError) as raised:
+        configure_walk(**argument)
+    assert len(str(raised.value)) < 2000
+    assert ("and 19" in str(raised.value)) == isinstance(next(iter(argument.values())), dict)

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from safetensors.numpy import load_file, save_file
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 import baselines
@@ -314,6 +315,7 @@ def trained(algorithm: Any, **options: Any) -> tuple[Any, VecNormalize, Residual
     env = ResidualVectorWrapper(vector("testbed", 4), "input", history=1)
     venv = VecNormalize(SB3VecEnv(env))
     model = algorithm("MlpPolicy", venv, device="cpu", seed=0, policy_kwargs={"net_arch": [16, 16]}, **options)
+    model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
     model.learn(64)
     return model, venv, env
 

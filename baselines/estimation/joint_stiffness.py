@@ -16,13 +16,10 @@ which the matrix inversion lemma solves in closed form.
 
 import numpy as np
 
-from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.compensators import GravityCompensator, presliding_friction
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.runtime.robot_model import WalkerModel
-
-PRESLIDING_RAD = 1e-3
-"""Displacement over which the friction turns round."""
 
 
 class StiffnessPrior(Model):
@@ -53,18 +50,6 @@ def regressed(sums: Array, prior: StiffnessPrior) -> Array:
     rank_one = common / (own * (own + n * common))
     alone, shared = right / diagonal, rank_one / diagonal
     return alone + shared * (alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1)))[..., None]
-
-
-def friction_after(friction: Array, displacement: Array, coulomb: Array) -> Array:
-    """Coulomb friction of Dahl's model after a displacement of the link, (..., n) [N·m]; it resists the motion.
-
-    Args:
-        friction: Before it, (..., n) [N·m].
-        displacement: Of the link, (..., n) [rad].
-        coulomb: Its largest value, (n,) [N·m].
-    """
-    full = coulomb * np.sign(displacement)
-    return full + (friction - full) * np.exp(-np.abs(displacement) / PRESLIDING_RAD)
 
 
 class JointStiffnessObserver:
@@ -101,7 +86,7 @@ class JointStiffnessObserver:
         theta = rows[:, self._theta]
         q = theta - deflection
         moved = np.where(sums[0] > 0.0, q - last, 0.0)
-        friction = friction_after(friction, moved, self._coulomb)
+        friction = presliding_friction(friction, moved, self._coulomb)
         h = theta - self._compensator.at(rows).link_angle(theta, theta) + friction / self._stiffness
         y = deflection - h
         new = np.stack(sums) + measured * np.stack([np.ones_like(h), h, h * h, y, h * y])

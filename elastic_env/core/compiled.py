@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+from numba.extending import register_jitable
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -24,6 +25,11 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder can be written: every program compiles its own
         return numba.njit(**options)(function)
+
+
+def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a formula of a kernel that NumPy's arrays need too: Python calls it as it is, kernels compile it."""
+    return register_jitable(error_model="numpy")(function)
 
 
 def compile_now(function: Callable[..., Any], *arguments: Any) -> None:

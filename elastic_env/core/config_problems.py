@@ -1,5 +1,6 @@
 """What is wrong with the parameters of a model, in sentences that name each as its user wrote it."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -46,7 +47,8 @@ class Problem:
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
 
 
-_MOST_SAID = 20
+_MOST_SAID, _LONGEST_SAID = 20, 1900
+"""Problems and characters, after which an error says how many more problems there are."""
 
 
 def dotted(path: ParameterPath) -> str:
@@ -73,8 +75,11 @@ class ModelError(ConfigurationError):
     def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
         """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
         sentences = list(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
-        more = [f"and {len(sentences) - _MOST_SAID} more"] if len(sentences) > _MOST_SAID else []
-        return "\n".join([*sentences[:_MOST_SAID], *more])
+        lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
+        fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
+        said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]
+        more = [f"and {len(sentences) - len(said)} more"] if len(said) < len(sentences) else []
+        return "\n".join([*said, *more])
 
 
 def problems_of(model: type[BaseModel], error: ValidationError, values: Mapping[str, Any]) -> list[Problem]:
@@ -109,12 +114,11 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             return Problem(path, "rule", str(problem["ctx"]["error"]))
         case "model_type":
             return Problem(path, "must", f"must be a mapping of parameters, got {given}")
-        case "too_short":
-            least = problem["ctx"]["min_length"]
-            return Problem(path, "must", f"must have at least {least} {_entries(least)}, got {given}")
-        case "too_long":
-            most = problem["ctx"]["max_length"]
-            return Problem(path, "must", f"must have at most {most} {_entries(most)}, got {given}")
+        case "too_short" | "too_long" as kind:
+            bound, key = ("least", "min_length") if kind == "too_short" else ("most", "max_length")
+            number = problem["ctx"][key]
+            entries = "entry" if number == 1 else "entries"
+            return Problem(path, "must", f"must have at {bound} {number} {entries}, got {given}")
         case "string_too_long":
             return Problem(path, "must", f"must have at most {problem['ctx']['max_length']} characters, got {given}")
         case "string_pattern_mismatch":
@@ -129,10 +133,6 @@ _KINDS = {
     "bool_type": "true or false", "bool_parsing": "true or false",
 }  # fmt: skip
 """What a parameter must be, where Pydantic's words are not those of a configuration."""
-
-
-def _entries(number: int) -> str:
-    return "entry" if number == 1 else "entries"
 
 
 def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:

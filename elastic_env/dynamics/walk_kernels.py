@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, within_compiled
 from elastic_env.core.signals import Array, BoolArray, IntArray, Parameter
 
 FIRST_HALF, SECOND_HALF = 1, 2
@@ -86,7 +86,8 @@ def begin(physics: Any, walker: Any, noise: Any, worlds: BoolArray, rows: Any) -
                 settle_imu(truth, drawn, bias, constants.quality, shown)
             imu_is_due = row_of(walker.plan, truth.step).imu_is_due  # as always at first
             measure(truth, drawn, bias, constants.quality, imu_is_due, shown)
-            shown.encoder_before[:] = shown.encoder
+            for i in range(len(shown.encoder)):
+                shown.encoder_before[i] = shown.encoder[i]
 
 
 @compiled
@@ -253,7 +254,9 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
             return
         for i, angle in enumerate((row.roll, row.pitch)):
             drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
-            shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], drawn, quality)
+            shown.imu_attitude[i] = shown_angle(
+                angle, bias.imu_attitude[i], drawn, quality.imu_bias_rad, quality.imu_sine_error_rad
+            )
         for i in range(3):
             shown.imu_rate[i] = noise.imu_rate[i] * quality.noise.imu_rate[i] + row.pelvis_rate[i]
 
@@ -263,7 +266,9 @@ def show_inertial(bias: Any, quality: Any, shown: Any) -> None:
     """What an inertial IMU shows of its own state: noise is in it, errors of the mounting come on top."""
     roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
     for i, angle in enumerate((roll, pitch)):
-        shown.imu_attitude[i] = shown_angle(angle, bias.imu_attitude[i], 0.0, quality)
+        shown.imu_attitude[i] = shown_angle(
+            angle, bias.imu_attitude[i], 0.0, quality.imu_bias_rad, quality.imu_sine_error_rad
+        )
     for i in range(3):
         shown.imu_rate[i] = shown.imu_gyro[i]
 
@@ -378,17 +383,16 @@ def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, flo
     return y * other[2] - z * other[1], z * other[0] - x * other[2], x * other[1] - y * other[0]
 
 
-@compiled
-def in_whole_counts(angle: float, count_rad: float) -> float:
+@within_compiled
+def in_whole_counts(angle: Any, count_rad: float) -> Any:
     """The nearest whole counts of an encoder, as an angle [rad]; counts of 0 leave it as it is."""
     return np.rint(angle / count_rad) * count_rad if count_rad > 0.0 else angle
 
 
-@compiled
-def shown_angle(angle: float, drawn_bias: float, noise: float, quality: Any) -> float:
+@within_compiled
+def shown_angle(angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float) -> Any:
     """An angle by the IMU, see `elastic_env.runtime.sensors.attitude` [rad]."""
-    constant = quality.imu_bias_rad + quality.imu_sine_error_rad * np.sin(angle)
-    return angle + drawn_bias + noise + constant
+    return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
 
 
 @compiled
@@ -454,12 +458,16 @@ def observe(row: Any, shown: Any, coming: Any, period_s: float, observed: Any) -
         observed.encoder_rate[i] = (shown.encoder[i] - shown.encoder_before[i]) / period_s
         observed.reference_angle[i], observed.reference_rate[i] = coming.q[i], coming.q_dot[i]
         observed.reference_acceleration[i], observed.last_command[i] = coming.q_ddot[i], row.command[i]
-    observed.imu_attitude[:], observed.imu_rate[:], observed.wrench[:] = (
-        shown.imu_attitude,
-        shown.imu_rate,
-        shown.wrench,
-    )
-    observed.clock[:], observed.load_share, observed.zmp_reference[:] = coming.clock, coming.share, coming.zmp
+    observed.load_share = coming.share
+    for i in range(2):
+        observed.imu_attitude[i], observed.zmp_reference[i] = shown.imu_attitude[i], coming.zmp[i]
+    for i in range(3):
+        observed.imu_rate[i], observed.clock[i] = shown.imu_rate[i], coming.clock[i]
+        for foot in range(2):
+            observed.wrench[foot, 0, i], observed.wrench[foot, 1, i] = (
+                shown.wrench[foot, 0, i],
+                shown.wrench[foot, 1, i],
+            )
 
 
 @compiled

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from elastic_env.core.draws import Draws
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.core.state import Stateful
 from elastic_env.rendering.picture import Picture
@@ -297,7 +297,9 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(num_envs)]
     if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
-        raise ConfigurationError(f"{name} must be a whole number, one per world ({num_envs}), or None; got {seed!r}")
+        raise ConfigurationError(
+            f"{name} must be a whole number, one per world ({num_envs}), or None; got {shown(seed)}"
+        )
     if len(seed) != num_envs:
         raise ConfigurationError(f"a list of seeds must have one seed per world, {num_envs}, got {len(seed)}")
     return [None if one is None else int(one) for one in seed]
@@ -307,7 +309,7 @@ def _checked_mask(mask: Any, num_envs: int) -> BoolArray:
     given = np.asarray(mask)
     if given.dtype != np.bool_ or given.shape != (num_envs,):
         raise ConfigurationError(
-            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got {mask!r}"
+            f"options['reset_mask'] must be an array of {num_envs} booleans, one per world, got {shown(mask)}"
         )
     return given
 

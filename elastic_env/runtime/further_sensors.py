@@ -15,7 +15,7 @@ control step, the offset every episode.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -28,28 +28,16 @@ from elastic_env.runtime.scenario import Scenario
 from elastic_env.runtime.sensors import NoiseStream, quantise
 
 
-class Measured(Protocol):
-    """What sensors need of the truth of a task, one row per world."""
-
-    @property
-    def q(self) -> Array:
-        """Link angles, (num_worlds, n) [rad]."""
-        ...
-
-    @property
-    def joint_torque(self) -> Array:
-        """Of spring and damper on the links, (num_worlds, n) [N·m]."""
-        ...
-
-    @property
-    def specific_force(self) -> Array:
-        """Acceleration of the IMU minus gravity, in its frame, (num_worlds, 3) [m/s²]."""
-        ...
-
-
 @dataclass(frozen=True)
 class Felt:
-    """What is `Measured`, as it is."""
+    """What sensors need of the truth of a task, one row per world.
+
+    Attributes:
+        q: Link angles, (num_worlds, n) [rad].
+        joint_torque: Of spring and damper on the links, (num_worlds, n) [N·m].
+        specific_force: Acceleration of the IMU minus gravity, in its frame, (num_worlds, 3) [m/s²]; nan
+            where no sensor asks for it.
+    """
 
     q: Array
     joint_torque: Array
@@ -71,7 +59,7 @@ class Sensor:
 
     unit: str
     meaning: str
-    truth: Callable[[Measured], Array]
+    truth: Callable[[Felt], Array]
     axes: Mapping[str, Mirrored] | None = None
     noise: float = 0.0
     offset: float = 0.0
@@ -152,7 +140,7 @@ class FurtherSensors(Stateful):
         """Whether there is any."""
         return bool(self._sensors)
 
-    def restart(self, worlds: BoolArray, draws: Sequence[Draws], truth: Measured) -> None:
+    def restart(self, worlds: BoolArray, draws: Sequence[Draws], truth: Felt) -> None:
         """Draw the offsets of new episodes, and measure."""
         if self._noise is None:
             return
@@ -165,7 +153,7 @@ class FurtherSensors(Stateful):
         self.measure(worlds, truth)
         self._before = np.where(worlds[:, None], self._now, self._before)
 
-    def measure(self, worlds: BoolArray, truth: Measured) -> None:
+    def measure(self, worlds: BoolArray, truth: Felt) -> None:
         """Take new values in some worlds; the others keep theirs."""
         if self._noise is None:
             return

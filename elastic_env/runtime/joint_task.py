@@ -22,7 +22,7 @@ from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import PlanTable
-from elastic_env.runtime.further_sensors import ACCELEROMETER, FurtherSensors, specific_force
+from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
 from elastic_env.runtime.joint_config import JointConfig
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
@@ -91,26 +91,21 @@ class JointPlant:
 
 
 @dataclass(frozen=True)
-class JointTruth:
+class JointTruth(Felt):
     """Noise-free state of the joints and their true parameters, one row per world. For scoring and the oracle.
 
     Attributes:
-        theta, theta_dot, q, q_dot: Motor and link side, (num_worlds, n) [rad], [rad/s].
+        theta, theta_dot, q_dot: Motor and link side, (num_worlds, n) [rad], [rad/s].
         deflection: θ − q, (num_worlds, n) [rad].
-        joint_torque: Of spring and damper on the links, (num_worlds, n) [N·m].
         stiffness: True K, (num_worlds, n) [N·m/rad].
-        specific_force: At the IMU, (num_worlds, 3) [m/s²]; nan where no sensor asks for it.
         model: The true joints and links.
     """
 
     theta: Array
     theta_dot: Array
-    q: Array
     q_dot: Array
     deflection: Array
-    joint_torque: Array
     stiffness: Array
-    specific_force: Array
     model: RobotModel
 
 
@@ -351,7 +346,10 @@ class JointTask(Stateful):
             "servo_error": sample.servo_error,
             "command_rate": sample.command_rate,
         }
-        shown = _of_one(of_joints) if len(self._joints) == 1 else self._of_several(of_joints)
+        if len(self._joints) == 1:
+            shown = {name: values[:, 0].copy() for name, values in of_joints.items()}
+        else:
+            shown = self._of_several(of_joints)
         return {"time_s": sample.step * self.config.control_period_s, **shown, "rest": sample.rest.copy()}
 
     def _of_several(self, of_joints: dict[str, Array]) -> Signals:
@@ -393,7 +391,7 @@ class JointTask(Stateful):
         deflection = state.theta - state.q
         torque = self._joint_torque(deflection, state.theta_dot - state.q_dot)
         stiffness = np.broadcast_to(self._true_model.stiffness, torque.shape)
-        values = (state.theta, state.theta_dot, state.q, state.q_dot, deflection, torque, stiffness, self._force)
+        values = (state.q, torque, self._force, state.theta, state.theta_dot, state.q_dot, deflection, stiffness)
         return JointTruth(*(value.copy() for value in values), model=self._true_model)
 
     def _joint_torque(self, deflection: Array, deflection_rate: Array) -> Array:
@@ -438,8 +436,3 @@ class JointTask(Stateful):
             imu=np.where(due[:, None], attitude(scenario.imu, self._state.q, self._imu_bias, noise), last.imu),
         )
         return fresh if worlds.all() else last.with_worlds(worlds, fresh)
-
-
-def _of_one(of_joints: dict[str, Array]) -> Signals:
-    """The signals of the only joint."""
-    return {name: values[:, 0].copy() for name, values in of_joints.items()}

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from elastic_env.core.config import plain_numbers
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.signals import NO_SIGNALS, Array, SignalTable
 from elastic_env.dynamics.biped import Biped
 from elastic_env.joint.elasticity import ElasticJoint, Servo
@@ -138,9 +138,9 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
                 raise TypeError
             return np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {given!r}") from None
+            raise ConfigurationError(f"stiffness must be numbers [N·m/rad], got {shown(given)}") from None
     if isinstance(value, bool) or not isinstance(value, int | float | str | Path):
-        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {value!r}")
+        raise ConfigurationError(f"stiffness must be a number [N·m/rad] or an identification file, got {shown(value)}")
     try:
         return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
     except (TypeError, ValueError):

@@ -13,6 +13,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.core.state import Stateful
+from elastic_env.dynamics.walk_kernels import in_whole_counts, shown_angle
 
 
 class AttitudeSensor(Model):
@@ -116,11 +117,6 @@ def angle_of_count(counts_per_turn: int | None) -> float:
     return 0.0 if counts_per_turn is None else 2.0 * np.pi / counts_per_turn
 
 
-def in_whole_counts(angle: Array, count_rad: float) -> Array:
-    """The nearest whole counts of an encoder, as an angle [rad]; counts of 0 leave it as it is."""
-    return np.rint(angle / count_rad) * count_rad if count_rad > 0.0 else angle
-
-
 def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Array) -> Array:
     """Measured angle of the attitude sensor.
 
@@ -133,14 +129,7 @@ def attitude(sensor: AttitudeSensor, angle: Array, drawn_bias: Array, noise: Arr
     Returns:
         (...) [rad].
     """
-    return shown_angle(angle, drawn_bias, noise, sensor.noise_rad, sensor.bias_rad, sensor.sine_error_rad)
-
-
-def shown_angle(
-    angle: Array, drawn_bias: Array, noise: Array, noise_rad: float, bias_rad: float, sine_error_rad: float
-) -> Array:
-    """What an attitude sensor shows of an angle, with the parameters of `AttitudeSensor` [rad]."""
-    return angle + drawn_bias + noise_rad * noise + (bias_rad + sine_error_rad * np.sin(angle))
+    return shown_angle(angle, drawn_bias, sensor.noise_rad * noise, sensor.bias_rad, sensor.sine_error_rad)
 
 
 def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray:

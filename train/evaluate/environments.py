@@ -197,10 +197,6 @@ def _kind(reference: Reference) -> str:
     return str(reference.get("kind")) if isinstance(reference, dict) else str(reference)
 
 
-def _is_drawn(reference: Any) -> bool:
-    return make_reference(reference).is_random
-
-
 def _step_period(reference: Reference) -> Any:
     """Step period of a walker's reference, or its durations [s]."""
     if not isinstance(reference, dict):
@@ -239,7 +235,7 @@ _TESTBED = Environment(
     default_reference="hold",
     arguments=lambda reference: {"reference": reference},
     label=_kind,
-    draws=_is_drawn,
+    draws=lambda reference: make_reference(reference).is_random,  # pyright: ignore[reportArgumentType]
     abscissa=lambda _: {},
     traced=(
         "time_s", "reference_angle", "link_angle", "link_angle_imu", "deflection", "link_error", "link_error_imu",

@@ -1,6 +1,5 @@
 """`elastic identify`: the static experiment, its files and its table."""
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,7 @@ from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.robots.testbed.model import Pendulum
 from train.figures import plots
 from train.figures.testbed_plots import draw_identification
+from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.workers import plain_progress, show_progress
 
@@ -86,7 +86,8 @@ def run_identification(config: IdentifyConfig, console: Console, output: Path | 
         ]
         console.print(result_table(results[0]))
         if config.repeats > 1:
-            files.append(_write_repeats(results, config.seed, folder / "repeats.csv"))
+            repeats = [{"seed": config.seed + i, **result.model_dump()} for i, result in enumerate(results)]
+            files.append(write_records(repeats, folder / "repeats.csv"))
             console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -151,15 +152,6 @@ def identified_environments(config: IdentifyConfig) -> list[Any]:
         )
         for pendulum in pendulums
     ]  # fmt: skip
-
-
-def _write_repeats(results: Sequence[Identification], seed: int, path: Path) -> Path:
-    """One row per seed."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["seed", *type(results[0]).model_fields])
-        writer.writeheader()
-        writer.writerows({"seed": seed + i, **result.model_dump()} for i, result in enumerate(results))
-    return path
 
 
 def _spread(results: Sequence[Identification], truth: float) -> str:

@@ -1,6 +1,5 @@
 """`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as a policy."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from train.evaluate.environments import Column, environment
 from train.evaluate.evaluate import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.learning_plots import draw_trials
+from train.runs.escaping import write_records
 from train.runs.folders import provenance, run_folder
 from train.runs.workers import show_progress
 
@@ -151,11 +151,7 @@ def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, config: Ite
         for trial in trials
         for robot, metrics in enumerate(trial.metrics)
     ]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
+    return write_records(rows, path)
 
 
 def _save(config: IterateConfig, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:

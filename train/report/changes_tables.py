@@ -1,7 +1,6 @@
 """Paired changes as a table for the terminal and as CSV."""
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,40 +12,30 @@ from rich.table import Table
 from train.evaluate.changes import BEST_ANALYTIC, CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
 from train.evaluate.maps import HeatMap
 from train.evaluate.statistics import Estimate
-from train.runs.escaping import csv_row
+from train.runs.escaping import write_csv
 
 
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:
     """One row per change; metrics in SI units, changes and probabilities as shares of one."""
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
-    records = [_record(row, swept) for row in rows]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([*_HEAD, *swept, *_FIGURES])
-        writer.writerows(map(csv_row, records))
-    return path
+    return write_csv([*_HEAD, *swept, *_FIGURES], (_record(row, swept) for row in rows), path)
 
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
     """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as they are shown."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(_MAP_HEAD)
-        for found in maps:
-            ticks = found.x.ticks(found.known), found.y.ticks(found.known)
-            for y, row in zip(ticks[1], found.cells, strict=True):
-                for x, cell in zip(ticks[0], row, strict=True):
-                    for title, estimate in cell.levels.items():
-                        change = cell.learned.get(title)
-                        against = ("",) * 4 if change is None else (*_cells(change.relative), change.verdict)
-                        own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
-                        marks = [title == cell.best, title == cell.best_analytic]
-                        writer.writerow(
-                            csv_row(
-                                [*own, *_cells(estimate), *cell.failed[title], *marks, cell.best_analytic, *against]
-                            )
-                        )
-    return path
+    return write_csv(_MAP_HEAD, (row for found in maps for row in _rows_of(found)), path)
+
+
+def _rows_of(found: HeatMap) -> Iterator[list[object]]:
+    ticks = found.x.ticks(found.known), found.y.ticks(found.known)
+    for y, row in zip(ticks[1], found.cells, strict=True):
+        for x, cell in zip(ticks[0], row, strict=True):
+            for title, estimate in cell.levels.items():
+                change = cell.learned.get(title)
+                against = ("",) * 4 if change is None else (*_cells(change.relative), change.verdict)
+                own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
+                marks = [title == cell.best, title == cell.best_analytic]
+                yield [*own, *_cells(estimate), *cell.failed[title], *marks, cell.best_analytic, *against]
 
 
 _MAP_HEAD = (

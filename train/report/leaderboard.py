@@ -14,7 +14,7 @@ from train.evaluate.environments import Column
 from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
-from train.runs.escaping import csv_row, markdown_table, markdown_text
+from train.runs.escaping import markdown_table, markdown_text, write_csv
 
 _HEAD = (
     "track", "policy", "reference", "scope", "pooled", "column", "title", "metric", "mean", "low", "high", "failed",
@@ -240,10 +240,7 @@ def _entry_markdown(entry: Entry) -> str:
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they agree."""
     table, text = folder / "leaderboard.csv", folder / "leaderboard.md"
-    with table.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(_HEAD)
-        writer.writerows(csv_row(_record(s)) for s in found)
+    write_csv(_HEAD, map(_record, found), table)
     text.write_text(f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}", encoding="utf-8")
     return [table, text]
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from train.evaluate.changes import BEST_ANALYTIC, Change, by_line, percent_interval
+from train.evaluate.changes import Change, by_line, percent_interval
 from train.figures.map_plots import in_rows, panels
 from train.report.changes_tables import falls
 from train.report.leaderboard import leaderboard_markdown
@@ -28,11 +28,7 @@ def markdown(results: Results) -> str:
             key = ", ".join(f"{letter} {title}" for letter, title, _ in panel.key)
             head, rows = in_rows(panel)
             parts += [markdown_text(f"{panel.title}{key and f' ({key})'}:"), _markdown_table(head, rows, words=1)]
-    for title, rows in (
-        ("Residuals against their base", [row for row in results.changes if row.is_family and not row.is_rival]),
-        (f"Residuals against the {BEST_ANALYTIC}", [row for row in results.changes if row.is_rival]),
-        ("Baselines against one another", [row for row in results.changes if not row.is_family]),
-    ):
+    for title, rows in results.grouped_changes.items():
         if rows:
             parts += [f"## {title}", _changes_markdown(rows, results.swept_options)]
     if results.robots:

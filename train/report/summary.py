@@ -3,7 +3,6 @@
 Scores of an episode that failed are never averaged in; failures are counted beside.
 """
 
-import csv
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -16,7 +15,7 @@ from rich.table import Table
 
 from train.evaluate.environments import Column, Environment
 from train.evaluate.evaluate import Evaluation
-from train.runs.escaping import csv_record, markdown_table, markdown_text
+from train.runs.escaping import markdown_table, markdown_text, write_records
 
 _ANY_WIDTH = 10_000
 
@@ -106,13 +105,7 @@ def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
 
 def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """One row per episode; columns are names with units."""
-    records = [episode for evaluation in evaluations for episode in evaluation.episodes]
-    columns = list(dict.fromkeys(name for record in records for name in record))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(map(csv_record, records))
-    return path
+    return write_records([episode for evaluation in evaluations for episode in evaluation.episodes], path)
 
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:

@@ -85,6 +85,15 @@ class Results:
         return json.loads((self.folder / "metadata.json").read_text(encoding="utf-8"))
 
     @property
+    def grouped_changes(self) -> dict[str, list[Change]]:
+        """Changes by what is compared with what."""
+        return {
+            "Residuals against their base": [row for row in self.changes if row.is_family and not row.is_rival],
+            f"Residuals against the {BEST_ANALYTIC}": [row for row in self.changes if row.is_rival],
+            "Baselines against one another": [row for row in self.changes if not row.is_family],
+        }
+
+    @property
     def has_conditions(self) -> bool:
         """Whether its cells are conditions of their own, and not points of a curve or a map."""
         return self.swept is None and not self.maps

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
-from train.evaluate.changes import BEST_ANALYTIC, by_line
+from train.evaluate.changes import by_line
 from train.evaluate.evaluate import Evaluation
 from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
@@ -122,14 +122,9 @@ def _add_ladder(page: Page, results: Results) -> None:
 
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
-    trained = [row for row in results.changes if row.is_family and not row.is_rival]
-    against_best = [row for row in results.changes if row.is_rival]
-    others = [row for row in results.changes if not row.is_family]
+    *of_residuals, (name_of_others, others) = results.grouped_changes.items()
     more = {"colour": results.lines.colour, "swept": results.swept_options}
-    for name, rows in (
-        ("Residuals against their base", trained),
-        (f"Residuals against the {BEST_ANALYTIC}", against_best),
-    ):
+    for name, rows in of_residuals:
         if not rows:
             continue
         drawn = results.has_conditions
@@ -146,7 +141,7 @@ def _add_changes(page: Page, results: Results) -> None:
         page.add("changes", {"lines": by_line(rows), **more}, _if_long("Table of changes", rows))
     if others:
         page.section(
-            "Baselines against one another",
+            name_of_others,
             "Paired differences of means. Baselines are not trained: there are no training seeds to draw from.",
         )
         page.add("changes", {"lines": by_line(others), **more}, _if_long("Table of differences", others))

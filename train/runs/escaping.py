@@ -1,9 +1,11 @@
 """Text of a user, such as the label of a policy, in the formats of results: each has signs that mean something."""
 
+import csv
 import html
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -23,9 +25,17 @@ def csv_row(values: Iterable[Any]) -> list[Any]:
     return [csv_cell(value) for value in values]
 
 
-def csv_record(values: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of a CSV file by column."""
-    return {name: csv_cell(value) for name, value in values.items()}
+def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) -> Path:
+    """Write a CSV file."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([head, *map(csv_row, rows)])
+    return path
+
+
+def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
+    """Write a CSV file of rows by column; what a row does not have is empty."""
+    head = list(dict.fromkeys(name for record in records for name in record))
+    return write_csv(head, ([record.get(name, "") for name in head] for record in records), path)
 
 
 def markdown_text(text: str) -> str:

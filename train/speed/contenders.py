@@ -3,7 +3,8 @@
 import itertools
 import threading
 import time
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -23,27 +24,29 @@ from train.evaluate.evaluate import blamed, make_policy, make_vector_env
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class Contender(Protocol):
+class Contender(ABC):
     """Something that plays control steps.
 
     Attributes:
         title: What it is.
         num_envs: Worlds.
+        env: Whatever it plays in.
     """
 
     title: str
     num_envs: int
+    env: Any
 
+    @abstractmethod
     def run(self, steps: int) -> float:
         """Play about so many control steps in every world; control steps per second of all worlds together."""
-        ...
 
     def close(self) -> None:
         """End what it has started."""
-        ...
+        self.env.close()
 
 
-class VectorLoop:
+class VectorLoop(Contender):
     """Our vector environment, with zero offsets or a policy in its loop; keeps the servo inputs of its last run."""
 
     def __init__(
@@ -80,12 +83,8 @@ class VectorLoop:
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
         self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
 
-    def close(self) -> None:
-        """See `Contender`."""
-        self.env.close()
 
-
-class ScalarLoop:
+class ScalarLoop(Contender):
     """Our scalar environment under zero offsets, without Gymnasium's checks; keeps the servo inputs of its last run."""
 
     title, num_envs = "scalar env", 1
@@ -108,12 +107,8 @@ class ScalarLoop:
                 self.env.reset()
         return steps / (time.perf_counter() - begin)
 
-    def close(self) -> None:
-        """See `Contender`."""
-        self.env.close()
 
-
-class RawWorlds:
+class RawWorlds(Contender):
     """`mj_step` and nothing else: threads that share the worlds out, each with one `MjData`, warm in its cache.
 
     It starts from the states of an environment and plays the servo inputs of its last run: on a thread nothing
@@ -167,24 +162,17 @@ class RawWorlds:
         return state
 
 
-class _ForeignLoop:
+class _ForeignLoop(Contender):
     """Scalar environments of ours in somebody else's vector environment, under zero offsets."""
 
-    title: str
-    num_envs: int
-    _env: Any
     _action: Array
 
     def run(self, steps: int) -> float:
         """See `Contender`."""
         begin = time.perf_counter()
         for _ in range(steps):
-            self._env.step(self._action)
+            self.env.step(self._action)
         return self.num_envs * steps / (time.perf_counter() - begin)
-
-    def close(self) -> None:
-        """See `Contender`."""
-        self._env.close()
 
 
 class GymnasiumLoop(_ForeignLoop):
@@ -192,11 +180,11 @@ class GymnasiumLoop(_ForeignLoop):
 
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
         self.title, self.num_envs = f"Gymnasium {kind.capitalize()}VectorEnv", num_envs
-        self._env = gymnasium.make_vec(
+        self.env = gymnasium.make_vec(
             environment(env).id, num_envs=num_envs, vectorization_mode=kind, **_arguments(env)
         )
-        self._env.reset(seed=0)
-        self._action = np.zeros(self._env.action_space.shape or (), dtype=np.float32)
+        self.env.reset(seed=0)
+        self._action = np.zeros(self.env.action_space.shape or (), dtype=np.float32)
 
 
 class SB3Loop(_ForeignLoop):
@@ -207,17 +195,18 @@ class SB3Loop(_ForeignLoop):
 
         self.title, self.num_envs = f"SB3 {kind}", num_envs
         makers = [_Maker(env)] * num_envs
-        self._env = DummyVecEnv(makers) if kind == "DummyVecEnv" else SubprocVecEnv(makers, start_method="spawn")
-        self._env.reset()
-        self._action = np.zeros((num_envs, *(self._env.action_space.shape or ())), dtype=np.float32)
+        self.env = DummyVecEnv(makers) if kind == "DummyVecEnv" else SubprocVecEnv(makers, start_method="spawn")
+        self.env.reset()
+        self._action = np.zeros((num_envs, *(self.env.action_space.shape or ())), dtype=np.float32)
 
 
-class PPOLoop:
+class PPOLoop(Contender):
     """PPO end to end, collecting and learning, of a residual on a base policy: our vector environment, or processes."""
 
     def __init__(self, env: str, policy: str, num_envs: int, threads: int, processes: bool = False) -> None:
         import torch
         from stable_baselines3 import PPO
+        from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.vec_env import SubprocVecEnv
 
         from baselines.residual_env import ResidualVectorWrapper
@@ -238,16 +227,14 @@ class PPOLoop:
             "MlpPolicy", venv, n_steps=self._rollout, batch_size=512, n_epochs=10, gamma=0.95, device="cpu",
             policy_kwargs={"net_arch": [64, 64]},
         )  # fmt: skip
+        self._model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
+        self.env = self._model.get_env()
 
     def run(self, steps: int) -> float:  # noqa: ARG002  a whole iteration is the least there is
         """See `Contender`: one iteration of 512 decisions."""
         before, begin = self._model.num_timesteps, time.perf_counter()
         self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
         return (self._model.num_timesteps - before) * self._period / (time.perf_counter() - begin)
-
-    def close(self) -> None:
-        """See `Contender`."""
-        self._model.get_env().close()  # type: ignore[union-attr]
 
 
 def untrained_residual(base: Any, env: Any) -> ResidualPolicy:

@@ -1,7 +1,6 @@
 """What can go wrong on a bus, by switch: for trying out what a program does about it."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -81,8 +80,3 @@ def flip_bit(data: bytes, generator: np.random.Generator) -> bytes:
     bit = int(generator.integers(8 * len(data)))
     changed[bit // 8] ^= 1 << bit % 8
     return bytes(changed)
-
-
-def changed(faults: Faults, changes: dict[str, Any]) -> Faults:
-    """Faults with some of them changed, validated."""
-    return faults.replace(**changes)

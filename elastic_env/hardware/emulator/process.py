@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.hardware.emulator.config import EmulatorConfig
-from elastic_env.hardware.emulator.faults import Angles, changed, damage, distort, flip_bit
+from elastic_env.hardware.emulator.faults import Angles, damage, distort, flip_bit
 from elastic_env.hardware.emulator.joints import Joints
 from elastic_env.hardware.emulator.mip import attitude_packet
 from elastic_env.hardware.emulator.servo import EmulatedServo
@@ -145,7 +145,7 @@ class Emulator:
 
     def set_faults(self, changes: dict[str, Any]) -> None:
         """Switch faults on and off."""
-        self.faults = changed(self.faults, changes)
+        self.faults = self.faults.replace(**changes)
         for servo in self._servos:
             servo.overload(self.faults.overload)
             servo.heat(self.faults.hot)

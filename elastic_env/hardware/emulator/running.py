@@ -3,6 +3,7 @@
 import json
 import subprocess
 import time
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ _LONGEST_SWING_S, _REST_RAD_S = 10.0, 0.02
 _LOOK_S, _STILL_LOOKS = 0.05, 3  # where a swing turns back it stands still for one look
 
 
-class RunningEmulator:
+class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     """Starts an emulator; a context manager that ends it.
 
     Args:
@@ -76,9 +77,6 @@ class RunningEmulator:
         if self._process.stdout is not None:
             self._process.stdout.close()
         self._process.wait(timeout=10)
-
-    def __enter__(self) -> "RunningEmulator":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -11,6 +11,7 @@ import os
 import struct
 import subprocess
 import time
+from contextlib import AbstractContextManager
 
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.imu.attitude_sample import Attitude, Axis, PlausibleAttitudes
@@ -68,7 +69,7 @@ class SharedSample:
         return self._last
 
 
-class AttitudeStream:
+class AttitudeStream(AbstractContextManager["AttitudeStream"]):
     """Reads an IMU that streams its filter's Euler angles (MIP set 0x82, field 0x05).
 
     Args:
@@ -138,9 +139,6 @@ class AttitudeStream:
         finally:
             if lock is not None:
                 os.close(lock)
-
-    def __enter__(self) -> "AttitudeStream":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

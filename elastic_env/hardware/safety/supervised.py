@@ -49,7 +49,7 @@ class Cycle:
     """How much later than asked for the servos were read [s]."""
 
 
-class SupervisedBus:
+class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     """Servos on one port or several, moved through a supervisor process of their own.
 
     Args:
@@ -203,9 +203,6 @@ class SupervisedBus:
             except subprocess.TimeoutExpired:
                 self._process.terminate()
                 self._process.wait(timeout=5.0)
-
-    def __enter__(self) -> "SupervisedBus":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -40,7 +40,7 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
             raise unknown_name(f"argument of {ID}", name, ["port", *of_settings, *of_testbed])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
-        raise HardwareError(f"a scenario is of a simulation; on hardware it is what it is, got {scenario!r}")
+        raise HardwareError(f"a scenario is of a simulation; on hardware it is what it is, got {shown(scenario)}")
     settings = HardwareSettings(port=port, **{name: arguments.pop(name) for name in of_settings if name in arguments})
     config = configure_testbed(scenario="ideal", **arguments)
     return HardwareTestbedTask(config, settings)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
 from elastic_env.registration import Robot, require_models
@@ -56,7 +56,9 @@ def configure_walk(
     """
     require_models(joint=(joint, ElasticJoint), robot=(robot, Thormang), reward=(reward, WalkRewardWeights))
     if not isinstance(gait, dict | None):
-        raise ConfigurationError(f"gait must be a mapping of {', '.join(_GAIT)}, got {gait!r}; see also step_period")
+        raise ConfigurationError(
+            f"gait must be a mapping of {', '.join(_GAIT)}, got {shown(gait)}; see also step_period"
+        )
     for name in gait or {}:
         if name not in _GAIT:
             raise unknown_name("parameter of gait beside step_period and num_steps", name, _GAIT)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.biped import Biped
@@ -106,6 +105,8 @@ def enlarged(
     factors = np.linspace(largest, 1.0, _NUM_FACTORS)
     origin = planned.pelvis + shares(np.asarray(share)) @ (true.ankles - planned.ankles)
     pelvis = origin + factors[:, None] * (true.pelvis - origin)
+    from scipy.spatial.transform import Rotation  # takes a quarter of a second, and few draw
+
     R = Rotation.from_rotvec(np.outer(factors, Rotation.from_matrix(true.R).as_rotvec())).as_matrix()
     reaches = (np.linalg.norm(hip_to_ankle(robot, pelvis, R, true.ankles), axis=-1) <= robot.leg.reach).all(axis=-1)
     reaches[-1] = True  # the true posture
