@@ -11,9 +11,9 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
-from train.evaluate.conditions import Condition
+from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column, Environment, environment
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.evaluate import Evaluation, grouped
 from train.evaluate.families import Origin, origin
 from train.evaluate.statistics import Estimate, change, improvement, over_seeds, pair
 
@@ -171,14 +171,11 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
 
 def families(evaluations: Sequence[Evaluation]) -> dict[str, Origin]:
     """Families of residuals by title, with how they were trained."""
-    members: dict[str, dict[str, Evaluation]] = {}
-    for e in evaluations:
-        if e.condition.member is not None:
-            members.setdefault(e.condition.policy.title, {})[e.condition.member.folder] = e
-    return {
-        title: origin([e.condition.member for e in found.values() if e.condition.member is not None])
-        for title, found in members.items()
-    }
+    members: dict[str, dict[str, Member]] = {}
+    for title, member in ((e.condition.policy.title, e.condition.member) for e in evaluations):
+        if member is not None:
+            members.setdefault(title, {})[member.folder] = member
+    return {title: origin(list(found.values())) for title, found in members.items()}
 
 
 def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
@@ -186,7 +183,7 @@ def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
     together: dict[tuple[object, ...], Evaluation] = {}
     for number, e in enumerate(evaluations):
         c = e.condition
-        key = (number,) if c.member is None else (c.policy.title, c.reference_name, c.scenario, *_items(c.swept))
+        key = (number,) if c.member is None else (c.policy.title, *c.cell)
         if key in together:
             together[key].episodes.extend(e.episodes)
         else:
@@ -243,10 +240,7 @@ def level(members: Sequence[Evaluation], column: Column) -> Estimate:
 
 def by_cell(evaluations: Sequence[Evaluation]) -> dict[tuple[object, ...], list[Evaluation]]:
     """Evaluations of a policy by reference, scenario and swept values: one per training seed."""
-    cells: dict[tuple[object, ...], list[Evaluation]] = {}
-    for e in evaluations:
-        cells.setdefault((e.condition.reference_name, e.condition.scenario, *_items(e.condition.swept)), []).append(e)
-    return cells
+    return grouped(evaluations, lambda e: e.condition.cell)
 
 
 def _against(own: Sequence[Evaluation], base: Sequence[Evaluation], trained: Origin | None, groups: Groups
@@ -364,11 +358,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines: dict[tuple[object, ...], list[Change]] = {}
-    for row in rows:
-        lines.setdefault((row.policy, row.base, row.reference, row.scope, *_items(row.swept)), []).append(row)
+    lines = grouped(rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items()))
     return list(lines.values())
-
-
-def _items(values: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
-    return tuple(values.items())

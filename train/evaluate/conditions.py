@@ -147,6 +147,11 @@ class Condition(Model):
         return self.label or self.environment.label(self.reference)
 
     @property
+    def cell(self) -> tuple[object, ...]:
+        """What tells the cells of a policy apart: motion, scenario and what is varied."""
+        return (self.reference_name, self.scenario, *self.swept.items())
+
+    @property
     def number(self) -> float | None:
         """What of the reference scores can be drawn against, such as the step period [s]; None for nothing."""
         return next(iter(self.environment.abscissa(self.reference).values()), None)

@@ -17,7 +17,7 @@ from elastic_env.runtime.scenario import GROUNDS
 from train.evaluate.changes import Change, families, level, paired
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.evaluate import Evaluation, grouped
 from train.evaluate.statistics import Estimate
 
 _UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}
@@ -179,13 +179,14 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
         evaluations: All cells, one per training seed.
         config: The axes.
     """
-    groups: dict[str, list[Evaluation]] = {}
-    for e in evaluations:
+
+    def title_of(e: Evaluation) -> str:
         motion = [] if config.motion else [e.condition.environment.title(e.condition.reference_name)]
-        groups.setdefault(", ".join([*motion, e.condition.scenario]), []).append(e)
+        return ", ".join([*motion, e.condition.scenario])
+
     return [
         _heat_map(title, own, config, column)
-        for title, own in groups.items()
+        for title, own in grouped(evaluations, title_of).items()
         for column in own[0].condition.environment.judged
     ]
 
@@ -211,10 +212,7 @@ def failed_of(members: Sequence[Evaluation]) -> tuple[int, int]:
 
 
 def _heat_map(title: str, evaluations: Sequence[Evaluation], config: MapConfig, column: Column) -> HeatMap:
-    cells: dict[tuple[int, int], dict[str, list[Evaluation]]] = {}
-    for e in evaluations:
-        place = config.y.place(e.condition), config.x.place(e.condition)
-        cells.setdefault(place, {}).setdefault(e.condition.policy.title, []).append(e)
+    cells = grouped(evaluations, lambda e: (config.y.place(e.condition), config.x.place(e.condition)))
     known = evaluations[0].condition.environment
     return HeatMap(
         title=title, column=column, x=config.x, y=config.y, known=known,
@@ -227,8 +225,9 @@ def _heat_map(title: str, evaluations: Sequence[Evaluation], config: MapConfig, 
     )  # fmt: skip
 
 
-def _cell(policies: Mapping[str, list[Evaluation]], column: Column) -> MapCell:
+def _cell(evaluations: Sequence[Evaluation], column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
+    policies = grouped(evaluations, lambda e: e.condition.policy.title)
     scores = {title: (level(own, column), failed_of(own)) for title, own in policies.items()}
     tracks = {title: own[0].condition.track for title, own in policies.items()}
     analytic = best_of({title: scored for title, scored in scores.items() if tracks[title] is Track.STANDARD})

@@ -9,7 +9,7 @@ from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
 from train.evaluate.changes import by_cell, opponents
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.evaluate import Evaluation, grouped
 from train.evaluate.maps import failed_of
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
 
@@ -54,16 +54,13 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     """
     found = []
     others = opponents(evaluations)
-    for title in dict.fromkeys(e.condition.policy.title for e in evaluations):
-        cells = by_cell([e for e in evaluations if e.condition.policy.title == title])
-        for (reference, scenario, *swept), members in cells.items():
+    policies = {title: by_cell(own) for title, own in grouped(evaluations, lambda e: e.condition.policy.title).items()}
+    for title, cells in policies.items():
+        for cell, members in cells.items():
+            reference, scenario, *swept = cell
             if swept or not _draws_robots(members[0]):
                 continue
-            against = {
-                name: theirs[0]
-                for name in others[title]
-                if (theirs := [e for e in evaluations if e.condition.policy.title == name and _is_in(e, members[0])])
-            }
+            against = {name: policies[name][cell][0] for name in others[title] if cell in policies.get(name, {})}
             for column in members[0].condition.environment.judged:
                 found.append(_scores((title, str(reference), str(scenario)), members, column, against))
     return found
@@ -106,9 +103,3 @@ def _draws_robots(e: Evaluation) -> bool:
         and len(e.episodes) >= FEWEST_ROBOTS
         and make_scenario(e.condition.scenario, known.walks).draws_robots
     )
-
-
-def _is_in(e: Evaluation, cell: Evaluation) -> bool:
-    """Whether an evaluation is of the same cell as another one."""
-    mine, other = e.condition, cell.condition
-    return (mine.reference_name, mine.scenario, mine.swept) == (other.reference_name, other.scenario, other.swept)

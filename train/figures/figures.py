@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from train.evaluate.environments import Environment
-from train.evaluate.evaluate import Evaluation, make_vector_env
+from train.evaluate.evaluate import Evaluation, grouped, make_vector_env
 from train.evaluate.maps import HeatMap
 from train.figures.map_plots import draw_map
 from train.figures.plots import draw_overview
@@ -69,11 +69,7 @@ def figure_name(name: str, evaluation: Evaluation) -> str:
 
 def cells(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    groups: dict[tuple[str, str], list[Evaluation]] = {}
-    for evaluation in evaluations:
-        key = evaluation.condition.reference_name, evaluation.condition.scenario
-        groups.setdefault(key, []).append(evaluation)
-    return list(groups.values())
+    return list(grouped(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values())
 
 
 def option_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
@@ -90,21 +86,17 @@ def reference_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
 
 
 def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment, folder: Path) -> list[Path]:
-    scenarios = swept_scenarios(evaluations)
     return [
         draw_sweep(
             reference_curves([e for e in evaluations if e.condition.scenario == scenario]), f"{known.quantity} [s]",
             folder / f"sweep_{_safe(scenario)}.png",
         )
-        for scenario in scenarios
+        for scenario in swept_scenarios(evaluations)
     ]  # fmt: skip
 
 
 def _by_policy(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
-    policies: dict[str, list[Evaluation]] = {}
-    for evaluation in evaluations:
-        policies.setdefault(evaluation.condition.policy.title, []).append(evaluation)
-    return policies
+    return grouped(evaluations, lambda e: e.condition.policy.title)
 
 
 def _stem(evaluation: Evaluation) -> str:
@@ -130,10 +122,8 @@ _FIGURES: dict[str, Draw] = {
 
 def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
     """Scenarios in which the references that are played are points of one axis."""
-    found: dict[str, list[Evaluation]] = {}
-    for e in evaluations:
-        found.setdefault(e.condition.scenario, []).append(e)
-    return [scenario for scenario, own in found.items() if has_swept_references(own)]
+    by_scenario = grouped(evaluations, lambda e: e.condition.scenario)
+    return [scenario for scenario, own in by_scenario.items() if has_swept_references(own)]
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
 from train.evaluate.changes import by_line
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.evaluate import grouped
 from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
 from train.report.charts import forest, ladder
@@ -78,11 +78,11 @@ def _add_leaderboard(page: Page, results: Results) -> None:
     main, single = board(found), scenarios_board(found)
     page.section("Leaderboard", legend(found))
     page.add("board", main)
-    head, rows = paired_rows(found)
-    if rows:
+    table = paired_rows(found)
+    if table[1]:
         page.add("heading", "What learning adds")
         page.add("text", PAIRED)
-        page.add("table", {"head": head, "rows": rows, "words": 3})
+        _add_table(page, table, words=3)
     if single is not None:
         page.add("board", single, folded=f"Single scenarios, {main.columns[0][1]}")
 
@@ -152,8 +152,13 @@ def _add_robots(page: Page, results: Results) -> None:
     if not results.robots:
         return
     page.section("Drawn robots", ROBOTS)
-    head, rows = robots_table(results.robots)
-    page.add("table", {"head": head, "rows": rows, "words": WORDS}, _if_long("Table of drawn robots", rows))
+    _add_table(page, robots_table(results.robots), WORDS, "Table of drawn robots")
+
+
+def _add_table(page: Page, table: tuple[list[str], list[list[str]]], words: int, title: str = "Table") -> None:
+    """A table of a head and rows, whose first columns hold words; folded away under its title where it is long."""
+    head, rows = table
+    page.add("table", {"head": head, "rows": rows, "words": words}, _if_long(title, rows))
 
 
 def _if_long(title: str, rows: Sequence[object]) -> str | None:
@@ -164,9 +169,7 @@ def _if_long(title: str, rows: Sequence[object]) -> str | None:
 def _add_phases(page: Page, results: Results) -> None:
     for title, columns in results.lines.environment.splits:
         page.section(title, SCORES)
-        head, rows = scores(results, columns)
-        content = {"head": head, "rows": rows, "words": 3 + len(results.swept_options)}
-        page.add("table", content, _if_long("Table", rows))
+        _add_table(page, scores(results, columns), words=3 + len(results.swept_options))
 
 
 def _add_curves(page: Page, results: Results) -> None:
@@ -191,13 +194,18 @@ def _add_sweeps(page: Page, results: Results) -> None:
     if results.swept is not None:
         for reference in lines.references:
             for scenario in lines.scenarios:
+                cells = {t: lines.cell(t, reference_name=reference, scenario=scenario) for t in lines.titles}
                 points = {
-                    t: _by_option(lines.cell(t, reference_name=reference, scenario=scenario)) for t in lines.titles
+                    t: grouped(own, lambda e: next(iter(e.condition.swept.values()), None)) for t, own in cells.items()
                 }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
     else:
         for scenario in swept_scenarios(results.evaluations):
-            points = {t: _by_number(lines.cell(t, scenario=scenario)) for t in lines.titles}
+            cells = {t: lines.cell(t, scenario=scenario) for t in lines.titles}
+            points = {
+                t: grouped((e for e in own if e.condition.number is not None), lambda e: e.condition.number)
+                for t, own in cells.items()
+            }
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
     if not charts:
         return
@@ -209,19 +217,3 @@ def _add_sweeps(page: Page, results: Results) -> None:
     for number, (title, points, label) in enumerate(charts):
         chart = sweep(lines, {t: own for t, own in points.items() if own}, label)
         page.add("chart", chart, folded=capital(title), is_open=number == 0)
-
-
-def _by_option(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Evaluation]]:
-    found: dict[float | None, list[Evaluation]] = {}
-    for e in evaluations:
-        found.setdefault(next(iter(e.condition.swept.values()), None), []).append(e)
-    return found
-
-
-def _by_number(evaluations: Sequence[Evaluation]) -> dict[float | None, list[Evaluation]]:
-    found: dict[float | None, list[Evaluation]] = {}
-    for e in evaluations:
-        number = e.condition.number
-        if number is not None:
-            found.setdefault(number, []).append(e)
-    return found
