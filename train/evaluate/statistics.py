@@ -40,6 +40,11 @@ class Estimate:
         """Whether there are training seeds enough for an interval."""
         return self.low is not None
 
+    @property
+    def cells(self) -> tuple[object, object, object]:
+        """Value and ends of the interval for a CSV file; empty where there is none."""
+        return self.value, "" if self.low is None else self.low, "" if self.high is None else self.high
+
     def scaled(self, factor: float) -> "Estimate":
         """In another unit; the factor is positive."""
         if self.low is None or self.high is None:

@@ -11,7 +11,6 @@ from rich.table import Table
 
 from train.evaluate.changes import BEST_ANALYTIC, CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
 from train.evaluate.maps import HeatMap
-from train.evaluate.statistics import Estimate
 from train.runs.escaping import write_csv
 
 
@@ -32,10 +31,10 @@ def _rows_of(found: HeatMap) -> Iterator[list[object]]:
         for x, cell in zip(ticks[0], row, strict=True):
             for title, estimate in cell.levels.items():
                 change = cell.learned.get(title)
-                against = ("",) * 4 if change is None else (*_cells(change.relative), change.verdict)
+                against = ("",) * 4 if change is None else (*change.relative.cells, change.verdict)
                 own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
                 marks = [title == cell.best, title == cell.best_analytic]
-                yield [*own, *_cells(estimate), *cell.failed[title], *marks, cell.best_analytic, *against]
+                yield [*own, *estimate.cells, *cell.failed[title], *marks, cell.best_analytic, *against]
 
 
 _MAP_HEAD = (
@@ -55,7 +54,7 @@ def _record(row: Change, swept: Sequence[str]) -> list[object]:
         row.policy, row.base, _role(row), "residual" if row.is_family else "baseline", row.reference, row.scope,
         row.is_group, "; ".join(row.marks), *(row.swept.get(name, "") for name in swept), row.column.metric,
         row.theirs, row.mine,
-        *_cells(row.relative), *_cells(row.improvement), row.num_seeds, row.num_pairs, row.falls, row.episodes,
+        *row.relative.cells, *row.improvement.cells, row.num_seeds, row.num_pairs, row.falls, row.episodes,
         row.base_falls, row.base_episodes, " ".join(f"{value:.6g}" for value in row.per_seed), row.sentence,
     ]  # fmt: skip
 
@@ -63,11 +62,6 @@ def _record(row: Change, swept: Sequence[str]) -> list[object]:
 def _role(row: Change) -> str:
     """What the other policy of a row is."""
     return BEST_ANALYTIC if row.is_rival else "base of the residual" if row.is_family else "policy to compare with"
-
-
-def _cells(estimate: Estimate) -> tuple[object, object, object]:
-    low, high = ("" if bound is None else bound for bound in (estimate.low, estimate.high))
-    return estimate.value, low, high
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:

@@ -1,7 +1,6 @@
 """Scores over drawn robots as a table for the terminal, for the report, and as CSV."""
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,8 @@ from rich.table import Table
 from train.evaluate.changes import percent_interval
 from train.evaluate.environments import Column
 from train.evaluate.robots import RobotScores
-from train.evaluate.statistics import Estimate
 from train.report.parts import number_interval
-from train.runs.escaping import csv_row
+from train.runs.escaping import write_csv
 
 ROBOTS = (
     "Over the robots of each cell that did not fail: mean, interquartile mean, and mean of the worst tenth. Better "
@@ -74,15 +72,14 @@ def _three(row: RobotScores) -> str:
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
     """One row per cell, metric and other policy; metrics in SI units, shares as shares of one."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(_HEAD)
-        for row in rows:
-            own = [row.policy, row.reference, row.scenario, row.column.metric, *_cells(row.mean), *_cells(row.middle)]
-            own += [*_cells(row.worst), row.failed, row.episodes]
-            for other, better in row.better.items() or [("", None)]:
-                writer.writerow(csv_row([*own, other, *(("",) * 3 if better is None else _cells(better))]))
-    return path
+    return write_csv(_HEAD, (record for row in rows for record in _records(row)), path)
+
+
+def _records(row: RobotScores) -> Iterator[list[object]]:
+    own = [row.policy, row.reference, row.scenario, row.column.metric, *row.mean.cells, *row.middle.cells]
+    own += [*row.worst.cells, row.failed, row.episodes]
+    for other, better in row.better.items() or [("", None)]:
+        yield [*own, other, *(("",) * 3 if better is None else better.cells)]
 
 
 _HEAD = (
@@ -90,8 +87,3 @@ _HEAD = (
     "interquartile_mean_low", "interquartile_mean_high", "worst_tenth", "worst_tenth_low", "worst_tenth_high",
     "failed", "episodes", "against", "better_share", "better_share_low", "better_share_high",
 )  # fmt: skip
-
-
-def _cells(estimate: Estimate) -> tuple[object, object, object]:
-    low, high = ("" if bound is None else bound for bound in (estimate.low, estimate.high))
-    return estimate.value, low, high
