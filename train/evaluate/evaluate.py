@@ -1,9 +1,9 @@
 """Run a policy in an environment, many episodes at once; keep its metrics, one time series, and the static points."""
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium
 import numpy as np
@@ -26,6 +26,8 @@ _BEFORE_FALL_S = 0.6
 """What happens in this time before a fall does not set the scale of a figure [s]."""
 
 Progress = Callable[[int], None]
+ItemT = TypeVar("ItemT")
+KeyT = TypeVar("KeyT", bound=Hashable)
 
 
 @dataclass
@@ -66,6 +68,14 @@ class Evaluation:
         """Samples of the trace that a figure's range goes by: all but those shortly before a fall."""
         time_s = self.trace["time_s"]
         return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
+
+
+def grouped(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
+    """Items such as evaluations by what they have in common, in the order in which it first occurs."""
+    groups: dict[KeyT, list[ItemT]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
 
 
 class PolicyFailedError(ElasticError):
@@ -168,24 +178,15 @@ def evaluate(condition: Condition, progress: Progress | None = None, num_threads
     at_once = _worlds_at_once(condition)
     for first in range(0, condition.episodes, at_once):
         worlds = min(at_once, condition.episodes - first)
-        _play(condition, first, worlds, num_threads, result, progress)
+        with closing(make_vector_env(condition, worlds, num_threads)) as env:
+            _play(env, condition, first, worlds, result, progress)
     return result
 
 
 def _play(
-    condition: Condition, first: int, worlds: int, num_threads: int, result: Evaluation, progress: Progress | None
-) -> None:
-    """One batch of worlds, each until the end of its first episode."""
-    env = make_vector_env(condition, worlds, num_threads)
-    try:
-        _play_in(env, condition, first, worlds, result, progress)
-    finally:
-        env.close()
-
-
-def _play_in(
     env: Any, condition: Condition, first: int, worlds: int, result: Evaluation, progress: Progress | None
 ) -> None:
+    """One batch of worlds, each until the end of its first episode."""
     policy = make_policy(condition.policy, env, condition.policy_options)
     if hasattr(policy, "rehearse"):
         with blamed(condition, 0):
@@ -195,7 +196,9 @@ def _play_in(
     is_scored = hasattr(policy, "link_estimate") and not condition.environment.is_real
     estimates = _Estimates(task, worlds) if is_scored else None
     imu = _ImuError(task, worlds) if isinstance(task.assumed_model, WalkerModel) else None
-    robots = _Robots(task) if hasattr(task, "robot_record") else None
+    parts = [part.metrics for part in (estimates, imu) if part is not None]
+    if hasattr(task, "robot_record"):  # of the robots that a walker draws from ranges
+        parts.append(task.robot_record)
     observation, info = env.reset(seed=condition.seed + first)
     records: list[dict[str, Any] | None] = [None] * worlds
     state, episode_start, step, reported = None, np.ones(worlds, dtype=np.bool_), 0, 0
@@ -212,7 +215,7 @@ def _play_in(
         episode_start = np.zeros(worlds, dtype=np.bool_)
         for world in np.flatnonzero(terminated | truncated):
             if records[world] is None:
-                own = [part.metrics(int(world)) for part in (estimates, imu, robots) if part is not None]
+                own = [metrics(int(world)) for metrics in parts]
                 records[world] = _record(condition, first + int(world), info, int(world), own)
                 if world == 0 and keeper is not None:
                     keeper.take(observation, info)
@@ -303,18 +306,6 @@ class _ImuError:
     def metrics(self, world: int) -> dict[str, float]:
         """RMS of the angle by which the shown vertical is off."""
         return {"imu_error_rms_rad": self._rms.of(world)}
-
-
-class _Robots:
-    """The robots that a walker draws from ranges."""
-
-    def __init__(self, task: Any) -> None:
-        self._task = task
-
-    def metrics(self, world: int) -> dict[str, float]:
-        """What was drawn, in figures."""
-        found: dict[str, float] = self._task.robot_record(world)
-        return found
 
 
 class _Estimates:

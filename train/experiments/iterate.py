@@ -1,6 +1,7 @@
 """`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as a policy."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +82,7 @@ def iterate(config: IterateConfig, console: Console, output: Path | None = None)
         ResultsExistError: The output folder holds results.
     """
     plots.require_matplotlib()
-    env = make_vector_env(config.condition, config.robots)
-    try:
+    with closing(make_vector_env(config.condition, config.robots)) as env:
         policy: IterativeLearner = make_policy(config.condition.policy, env)
         with run_folder("iterate", config.model_dump(mode="json"), config.seed, output) as folder:
             trials = _trials(config, env, policy, console)
@@ -92,8 +92,6 @@ def iterate(config: IterateConfig, console: Console, output: Path | None = None)
                 draw_trials(trials, columns, config.condition, folder / "trials.png"),
             ]
             policies = _save(config, env, policy, folder)
-    finally:
-        env.close()
     console.print(trials_table(trials, columns, config))
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True)

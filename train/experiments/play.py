@@ -3,6 +3,7 @@
 import io
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     steps = task.num_steps if max_s is None else max(round(min(max_s / period, task.num_steps)), 1)
-    try:
+    with closing(env):
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
             _rehearse(policy, condition, console)
@@ -48,18 +49,13 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
             _window(episode, period)
         else:
             _film(env, episode, steps, period, video, console)
-    finally:
-        env.close()
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
     """Let a policy learn on the robot, out of sight."""
     console.print(f"{condition.policy.title} learns on this robot first", soft_wrap=True)
-    unseen = make_vector_env(condition, 1)
-    try:
+    with closing(make_vector_env(condition, 1)) as unseen:
         policy.rehearse(unseen, condition.seed)
-    finally:
-        unseen.close()
 
 
 def _episode(env: Any, policy: Any, condition: Condition, steps: int, console: Console) -> Iterator[int]:

@@ -3,6 +3,7 @@
 import csv
 import shutil
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +116,7 @@ def played_together(
         For each condition the scores, (episodes, metrics), and which episodes failed, (episodes,).
     """
     sizes = [condition.episodes for condition in conditions]
-    worlds = mixed_env(conditions, sizes, num_threads)
-    try:
+    with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
         policy = make_policy(conditions[0].policy, worlds)
         seeds = [condition.seed + episode for condition in conditions for episode in range(condition.episodes)]
         values, failed = np.full((len(seeds), len(metrics)), np.nan), np.zeros(len(seeds), dtype=np.bool_)
@@ -132,7 +132,5 @@ def played_together(
                 values[first], failed[first] = scores[first], terminated[first]
                 playing &= ~starting
                 observation, _ = worlds.reset(options={"reset_mask": starting})
-    finally:
-        worlds.close()
     parts = np.cumsum(sizes)[:-1]
     return list(zip(np.split(values, parts), np.split(failed, parts), strict=True))
