@@ -26,7 +26,7 @@ from baselines.walking.foot_balance import FootBalance
 from baselines.walking.hip_torque import HipTorque
 from baselines.walking.posture import PostureFeedback
 from baselines.walking.stance_roll import StanceRoll
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 Builder = Callable[[Any, Any, PolicyOptions], Any]
@@ -65,32 +65,24 @@ def _zero(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:  # noq
     return Zero(model.observation_table)
 
 
-def _around_zero(compensator: Callable[..., Compensator]) -> Builder:
+def _around(core: Builder, compensator: Callable[..., Compensator], output: OutputMethod = "taylor") -> Builder:
     def build(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-        made = compensator(model, options.output or "taylor", options.gravity)
-        return Compensated(_zero(env, model, options), made, ramp_s=options.ramp_s)
+        made = compensator(model, options.output or output, options.gravity)
+        return Compensated(core(env, model, options), made, ramp_s=options.ramp_s)
 
     return build
 
 
-_friction = _around_zero(partial(DynamicCompensator, friction=True))
+_friction = _around(_zero, partial(DynamicCompensator, friction=True))
 
 
 def _disturbance_observer(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
-    build = _friction if options.observer.friction else _around_zero(DynamicCompensator)
+    build = _friction if options.observer.friction else _around(_zero, DynamicCompensator)
     return DisturbanceObserver(build(env, model, options), model, options.observer, options.ramp_s)
 
 
 def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
     return WalkingController(model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s)
-
-
-def _around_controller(compensator: Callable[..., Compensator], output: OutputMethod) -> Builder:
-    def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
-        made = compensator(model, options.output or output, options.gravity)
-        return Compensated(_controller(env, model, options), made, ramp_s=options.ramp_s)
-
-    return build
 
 
 def _open(build: Builder) -> Builder:
@@ -111,8 +103,7 @@ def _oracle(env: Any, model: RobotModel, options: PolicyOptions) -> Policy:
 
 def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
     """The compensated policy that a feedback is built on."""
-    if options.base not in COMPENSATED:
-        raise unknown_name("base of a feedback", options.base, COMPENSATED)
+    require_known("base of a feedback", [options.base], COMPENSATED)
     return COMPENSATED[options.base](env, model, options)
 
 
@@ -136,8 +127,7 @@ def learned_base(options: PolicyOptions, is_walker: bool) -> str:
     name = options.learned_base or ("adaptive_posture" if is_walker else "input")
     known = ON_THE_WALKER if is_walker else ON_JOINTS
     bases = [base for base, policy in known.items() if base != "iterative" and policy.track is Track.STANDARD]
-    if name not in bases:
-        raise unknown_name("base of iterative", name, bases)
+    require_known("base of iterative", [name], bases)
     return name
 
 
@@ -175,10 +165,10 @@ def _talos(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
 _WEIGHING = WalkingGains(weight_filter_s=1.0)
 
 COMPENSATED: Mapping[str, Builder] = {
-    "input": _around_controller(GravityCompensator, "none"),
-    "input_output": _around_controller(GravityCompensator, "taylor"),
-    "input_wrench": _around_controller(GravityCompensator, "wrench"),
-    "dynamic": _around_controller(DynamicCompensator, "wrench"),
+    "input": _around(_controller, GravityCompensator, "none"),
+    "input_output": _around(_controller, GravityCompensator, "taylor"),
+    "input_wrench": _around(_controller, GravityCompensator, "wrench"),
+    "dynamic": _around(_controller, DynamicCompensator, "wrench"),
 }
 """Compensated policies of a walker, which a feedback can build on."""
 
@@ -193,8 +183,8 @@ _LEARNED = ("learned_base", "learning")
 ON_JOINTS: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
     "uncompensated": NamedPolicy(_zero),
-    "input": NamedPolicy(_around_zero(GravityCompensator), _COMPENSATOR),
-    "dynamic": NamedPolicy(_around_zero(DynamicCompensator), _COMPENSATOR),
+    "input": NamedPolicy(_around(_zero, GravityCompensator), _COMPENSATOR),
+    "dynamic": NamedPolicy(_around(_zero, DynamicCompensator), _COMPENSATOR),
     "friction": NamedPolicy(_friction, _COMPENSATOR),
     "disturbance_observer": NamedPolicy(
         _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)

@@ -12,15 +12,8 @@ import numpy as np
 
 from baselines.adaptation.iterative_learning import credible, updated
 from baselines.adaptation.learned_signals import LearnedSignals
-from baselines.compensation.inputs import PolicyInputs, inputs_of
-from baselines.compensation.policy import (
-    Action,
-    ObservationView,
-    Policy,
-    PolicyWithInputs,
-    predicted,
-    taken_up,
-)
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import Action, ObservationView, Policy, PolicyAround, predicted, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray
@@ -30,7 +23,7 @@ _RETREAT = 0.5
 """Share of the offsets that is kept after a trial that failed, such as by a fall."""
 
 
-class LearnedOffsets(PolicyWithInputs):
+class LearnedOffsets(PolicyAround):
     """Any policy with a table of offsets added, row by row from the start of an episode.
 
     Memory per world: control steps since the start, then that of the policy.
@@ -64,11 +57,6 @@ class LearnedOffsets(PolicyWithInputs):
         self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
         self.tables = tables
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Those of the policy inside it."""
-        return inputs_of(self._policy)[1:]
-
     def predict_with(
         self,
         observation: Array,
@@ -85,10 +73,6 @@ class LearnedOffsets(PolicyWithInputs):
         steps = steps + 1.0
         total = np.asarray(action, dtype=np.float64) + self._at(steps[:, 0]).reshape(np.shape(action))
         return total.astype(np.float32), (steps, inner)
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw, (..., n) [rad]."""
-        return self._policy.link_estimate(observation, state[1])  # type: ignore[attr-defined]
 
     def _at(self, steps: Array) -> Array:
         """Offsets at a control step of every world, (num_worlds, n) [rad]; behind the table its last row."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from baselines.adaptation.estimators import Estimator
 from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
+from baselines.compensation.policy import Action, ObservationView, PolicyAround, PolicyWithInputs, taken_up
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import RobotModel
@@ -27,7 +27,7 @@ class AdaptationGains(Model):
     limit: float = quantity("1", 1.0, gt=0, lt=10, description="largest correction of the deflection")
 
 
-class OnlineStiffness(PolicyWithInputs):
+class OnlineStiffness(PolicyAround):
     """A compensated policy whose model of the joints is corrected by what is measured, see the module.
 
     Memory per world: steps, target and filtered r of the joints, then that of the estimator.
@@ -48,11 +48,6 @@ class OnlineStiffness(PolicyWithInputs):
         self._every = max(round(gains.period_s / model.control_period_s), 1)
         self._gain, self._limit = 1.0 - float(np.exp(-model.control_period_s / gains.filter_s)), gains.limit
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """See `PolicyWithInputs`."""
-        return self._policy.inputs
-
     def predict_with(
         self,
         observation: Array,
@@ -71,10 +66,6 @@ class OnlineStiffness(PolicyWithInputs):
         corrected = inputs.with_deflection(together)
         action, inner = self._policy.predict_with(observation, corrected, inner, episode_start, deterministic)
         return action, (memory, inner)
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `PolicyWithInputs`."""
-        return self._policy.link_estimate(observation, state[1])
 
     def _begin(self, num_worlds: int) -> Array:
         return np.hstack([np.zeros((num_worlds, 1 + 2 * self._n)), self._estimator.begin(num_worlds)])

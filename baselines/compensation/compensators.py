@@ -14,7 +14,7 @@ import numpy as np
 
 from baselines.compensation.contact_torque import LegTorque
 from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
-from elastic_env.core.errors import unknown_name
+from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
 from elastic_env.runtime.robot_model import RobotModel
@@ -129,8 +129,7 @@ class GravityCompensator:
     modelled: float | Array = 1.0
 
     def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
-        if output not in get_args(OutputMethod):
-            raise unknown_name("output compensator", output, get_args(OutputMethod))
+        require_known("output compensator", [output], get_args(OutputMethod))
         self.model = model
         self.stiffness = model.stiffness
         self.gravity = self._load = make_gravity(model, method)

@@ -4,20 +4,19 @@
 batch at once: in closed form for one hinge, from NumPy for a tree of them. All agree to rounding.
 """
 
+from collections.abc import Callable
 from typing import Any, Literal, Protocol, get_args
 
 import mujoco
 import numpy as np
 
 from baselines.compensation.contact_torque import ContactGravity, ContactMethod, PlannedTorque, WrenchTorque
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.rigid_body import RigidBody, require_hinge_tree
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 GravityMethod = Literal["hinge", "pinocchio", "batched", "com", "ankle", "lumped"]
-
-_FIXED_METHODS = ("hinge", "pinocchio", "batched")
 
 
 class GravityModel(Protocol):
@@ -66,20 +65,17 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         ConfigurationError: The method does not exist, or not for this robot.
     """
     if isinstance(model, WalkerModel):
-        if method is None:
-            return ContactGravity(model)
-        if method == "com" or method == "ankle" or method == "lumped":
-            return ContactGravity(model, method)
-        raise unknown_name("gravity method of a walker", method, get_args(ContactMethod))
-    if method is None:
-        method = "hinge" if len(model.joint_names) == 1 else "pinocchio"
-    if method == "hinge":
-        return FixedGravity(HingeTorque(model))
-    if method == "pinocchio":
-        return FixedGravity(RigidBody(model.rigid, model.joint_names))
-    if method == "batched":
-        return FixedGravity(BatchedGravity(model))
-    raise unknown_name("gravity method", method, _FIXED_METHODS)
+        chosen: Any = method or "com"
+        require_known("gravity method of a walker", [chosen], get_args(ContactMethod))
+        return ContactGravity(model, chosen)
+    methods: dict[str, Callable[[RobotModel], GravityModel]] = {
+        "hinge": HingeTorque,
+        "pinocchio": lambda model: RigidBody(model.rigid, model.joint_names),
+        "batched": BatchedGravity,
+    }
+    chosen = method or ("hinge" if len(model.joint_names) == 1 else "pinocchio")
+    require_known("gravity method", [chosen], methods)
+    return FixedGravity(methods[chosen](model))
 
 
 def make_load(model: RobotModel, output: str, gravity: Any) -> Any:

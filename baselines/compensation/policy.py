@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from baselines.compensation.compensators import Motion
-from baselines.compensation.inputs import NO_INPUTS, PolicyInputs
+from baselines.compensation.inputs import NO_INPUTS, PolicyInputs, inputs_of
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 
@@ -74,6 +74,21 @@ class PolicyWithInputs(ABC):
             observation: As in `predict`.
             state: What `predict` returned for it.
         """
+
+
+class PolicyAround(PolicyWithInputs):
+    """A policy around another one, whose state is the second part of its own."""
+
+    _policy: Any
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Those of the policy inside it."""
+        return inputs_of(self._policy)[1:]
+
+    def link_estimate(self, observation: Array, state: Any) -> Array:
+        """Link angles that the policy inside it saw, (..., n) [rad]."""
+        return self._policy.link_estimate(observation, state[1])
 
 
 def predicted(policy: Any, observation: Array, inputs: PolicyInputs, *call: Any) -> tuple[Any, Any]:

@@ -20,16 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.inputs import PolicyInputs, inputs_of
+from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
-from baselines.compensation.policy import (
-    Action,
-    ObservationView,
-    Policy,
-    PolicyWithInputs,
-    predicted,
-    taken_up,
-)
+from baselines.compensation.policy import Action, ObservationView, Policy, PolicyAround, predicted, taken_up
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import WalkerModel
@@ -58,7 +51,7 @@ def limited_in_rate(before: Array, value: Array, rate: float, period_s: float) -
     return before + np.clip(value - before, -rate * period_s, rate * period_s)
 
 
-class HipTorque(PolicyWithInputs):
+class HipTorque(PolicyAround):
     """Any policy of a walker with its hip rolls led by their measured torque, see the module.
 
     Memory per world: filtered torques and offsets of the two hip rolls.
@@ -79,11 +72,6 @@ class HipTorque(PolicyWithInputs):
         self._view, self._clock = ObservationView(table, self._dt), table.group("clock")
         self._torque = table.group(TORQUE_SENSOR)
         self._stiffness = model.stiffness[_HIP_ROLLS]
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Those of the policy inside it."""
-        return inputs_of(self._policy)[1:]
 
     def predict_with(
         self,
@@ -109,7 +97,3 @@ class HipTorque(PolicyWithInputs):
         total = np.array(action, dtype=np.float64)
         total[..., _HIP_ROLLS] += offset.reshape((*total.shape[:-1], 2))
         return total.astype(np.float32), (np.hstack([torque, offset]), inner)
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw, (..., 12) [rad]."""
-        return self._policy.link_estimate(observation, state[1])  # pyright: ignore[reportAttributeAccessIssue]

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.inputs import PolicyInputs, inputs_of
-from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, predicted, taken_up
+from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import Action, ObservationView, PolicyAround, predicted, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -42,7 +42,7 @@ class PostureGains(Model):
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
 
-class PostureFeedback(PolicyWithInputs):
+class PostureFeedback(PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
     Memory per world: steps, filtered roll and pitch, their integrals.
@@ -68,7 +68,7 @@ class PostureFeedback(PolicyWithInputs):
     @property
     def inputs(self) -> tuple[str, ...]:
         """See `PolicyWithInputs`."""
-        return (*inputs_of(self._policy)[1:], "posture_gain")
+        return (*super().inputs, "posture_gain")
 
     def predict_with(
         self,
@@ -88,10 +88,6 @@ class PostureFeedback(PolicyWithInputs):
         offsets = hip_offsets(turn, rows[:, self._share][:, 0])
         total = np.asarray(action, dtype=np.float64) + offsets.reshape(np.shape(action))
         return total.astype(np.float32), (memory, inner)
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `PolicyWithInputs`."""
-        return self._policy.link_estimate(observation, state[1])
 
     def _turned(self, rows: Array, memory: Array, change: Array | None) -> tuple[Array, Array]:
         """Turn of both hips against roll and pitch, (num_worlds, 2) [rad], and the new memory.
