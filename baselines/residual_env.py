@@ -23,6 +23,8 @@ from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.state import Stateful
+from elastic_env.runtime.envs import final_of, reset_mask
+from elastic_env.runtime.worlds import Transition
 
 
 class _Deciding(Stateful):
@@ -195,9 +197,7 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in every world, or in those of options["reset_mask"]."""
         self._rows, info = self.env.reset(seed=seed, options=options)
-        mask = np.ones(self.num_envs, dtype=np.bool_)
-        if options is not None and "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"])
+        mask = reset_mask(options, self.num_envs)
         self._deciding.begin(mask)
         self._done = self._done & ~mask
         features = self._deciding.observe(self._rows, mask)
@@ -220,23 +220,18 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         residual = self._deciding.decided(self._rows, actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
-        outcome = self._decide(residual, ~waiting)
+        features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1
-        outcome.truncated |= (self._cut_at == self._decisions) & ~outcome.terminated & ~waiting
-        features, info = outcome.features, outcome.info
-        self._done = outcome.terminated | outcome.truncated
+        truncated |= (self._cut_at == self._decisions) & ~terminated & ~waiting
+        self._done = terminated | truncated
         if waiting.any():
             features = self._restarted(waiting, features)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             ended = self._done.copy()
-            final = np.full(self.num_envs, None, dtype=object)
-            for world in np.flatnonzero(ended):
-                final[world] = features[world].copy()
-            final_info = dict(info)
+            info = final_of(features, info, ended)
             features = self._restarted(ended, features)
-            info = {"final_obs": final, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
         self._last = features.copy()
-        return features, outcome.reward, outcome.terminated, outcome.truncated, info
+        return features, reward, terminated, truncated, info
 
     def _restarted(self, worlds: BoolArray, features: Array) -> Array:
         """Features with those of new episodes in some worlds."""
@@ -245,8 +240,8 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         self._deciding.begin(worlds)
         return np.where(worlds[:, None], self._deciding.observe(self._rows, worlds), features)
 
-    def _decide(self, residual: Array, alive: BoolArray) -> "_Outcome":
-        """Hold a residual for a decision period in the worlds that are alive."""
+    def _decide(self, residual: Array, alive: BoolArray) -> Transition:
+        """Hold a residual for a decision period in the worlds that are alive; the observation is of features."""
         n = self.num_envs
         reward, terminated, truncated = np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
         final: Array | None = None
@@ -275,7 +270,7 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         features = self._deciding.observe(self._rows, ~(terminated | truncated))
         if final is not None:
             features = np.where((terminated | truncated)[:, None], final, features)
-        return _Outcome(features, reward, terminated, truncated, info)
+        return Transition(features, reward, terminated, truncated, info)
 
 
 @contextmanager
@@ -286,16 +281,6 @@ def _no_restarts(env: Any) -> Iterator[None]:
         yield
     finally:
         env.autoreset_mode = mode
-
-
-class _Outcome:
-    """What a decision came to."""
-
-    def __init__(
-        self, features: Array, reward: Array, terminated: BoolArray, truncated: BoolArray, info: dict[str, Any]
-    ) -> None:
-        self.features, self.reward, self.info = features, reward, info
-        self.terminated, self.truncated = terminated, truncated
 
 
 def _box(width: int) -> gymnasium.spaces.Box:

@@ -203,9 +203,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         With options["robot_seed"] = s world i has the robot, and the motion, that `reset(seed=s)` draws for it, under
         noise and pushes of its own: the same robot walks again. It may be a list, as `seed`, with None for a new one.
         """
-        mask = np.ones(self.num_envs, dtype=np.bool_)
-        if options is not None and "reset_mask" in options:
-            mask = _checked_mask(options["reset_mask"], self.num_envs)
+        mask = reset_mask(options, self.num_envs)
         seeds, robots = _seeds(seed, self.num_envs), _robot_seeds(options, self.num_envs)
         for world in np.flatnonzero(mask):
             if seeds[world] is not None:
@@ -267,16 +265,18 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
 
     def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
         """SAME_STEP: the worlds that end begin anew at once; their last observation and info are kept beside."""
-        final_observation = np.full(self.num_envs, None, dtype=object)
-        for world in np.flatnonzero(result.done):
-            final_observation[world] = result.observation[world].copy()
-        final_info = _with_mask(result.info, result.done)
+        final = final_of(result.observation, _with_mask(result.info, result.done), result.done)
         self._begin(result.done)
-        fresh = self._worlds.signals()
-        info = _without_metrics(_restarted_info(result.info, result.done, fresh))
-        info |= {"final_obs": final_observation, "_final_obs": result.done.copy()}
-        info |= {"final_info": final_info, "_final_info": result.done.copy()}
-        return self._worlds.task.observe(), info
+        info = _without_metrics(_restarted_info(result.info, result.done, self._worlds.signals()))
+        return self._worlds.task.observe(), info | final
+
+
+def final_of(observation: Array, info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
+    """What Gymnasium's SAME_STEP keeps of the worlds that end: their last observation, and the info of the step."""
+    last = np.full(len(done), None, dtype=object)
+    for world in np.flatnonzero(done):
+        last[world] = observation[world].copy()
+    return {"final_obs": last, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}
 
 
 def _draws(generators: Sequence[np.random.Generator], robots: Sequence[int | None]) -> list[Draws]:
@@ -305,7 +305,13 @@ def _seeds(seed: Any, num_envs: int, name: str = "seed") -> list[int | None]:
     return [None if one is None else int(one) for one in seed]
 
 
-def _checked_mask(mask: Any, num_envs: int) -> BoolArray:
+def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
+    """Worlds that a reset begins anew: those of options["reset_mask"], or all.
+
+    Raises:
+        ConfigurationError: The mask is no truth value per world.
+    """
+    mask = (options or {}).get("reset_mask", np.ones(num_envs, dtype=np.bool_))
     given = np.asarray(mask)
     if given.dtype != np.bool_ or given.shape != (num_envs,):
         raise ConfigurationError(

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.state import Stateful
+from elastic_env.runtime.envs import reset_mask
 from elastic_env.runtime.robot_model import RobotModel
 from elastic_env.runtime.task import Task
 from train.evaluate.conditions import Condition
@@ -96,9 +97,7 @@ class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
         World i gets seed + i, or the i-th of a list of seeds.
         """
         seeds: Any = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
-        mask: BoolArray = np.ones(self.num_envs, dtype=np.bool_)
-        if options is not None and "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"])
+        mask = reset_mask(options, self.num_envs)
 
         def begun(env: Any, worlds: slice) -> Array:
             if not mask[worlds].any():
