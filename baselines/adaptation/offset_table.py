@@ -12,10 +12,8 @@ from pydantic import Field, field_validator
 from safetensors.numpy import save
 
 from baselines.adaptation.learned_signals import LearningGains
-from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
-from elastic_env.core.config_problems import ModelError
+from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError, shown
-from elastic_env.core.json_text import parse_json
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
 
@@ -73,22 +71,11 @@ def read_table_description(folder: Path) -> TableDescription:
     Raises:
         ConfigurationError: There is none, or it is not valid.
     """
-    path = folder / DESCRIPTION
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(
-            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed "
-            f"({error.strerror}), as `elastic iterate` writes it"
-        ) from None
-    except ValueError as error:
-        raise ConfigurationError(f"{path} is not JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise ConfigurationError(f"{path} must be a mapping, got {type(content).__name__}")
-    try:
-        return TableDescription(**content)
-    except ModelError as error:
-        raise ConfigurationError(f"{path} describes no table: {error.named()}") from None
+    return load_json(
+        folder / DESCRIPTION, TableDescription, "table",
+        lambda why: f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed ({why}), "
+        "as `elastic iterate` writes it",
+    )  # fmt: skip
 
 
 def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:

@@ -17,10 +17,8 @@ from baselines.residual.evidence import caution
 from baselines.residual.features import Features
 from baselines.residual.network import Network, Tensors
 from baselines.residual.settings import ResidualSettings
-from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
-from elastic_env.core.config_problems import ModelError
+from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.json_text import parse_json
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
 
@@ -192,21 +190,11 @@ def read_description(folder: Path) -> ResidualDescription:
         ConfigurationError: There is none, or it is not valid.
     """
     folder = located(folder)
-    try:
-        content = parse_json((folder / DESCRIPTION).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(
-            f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({error.strerror}), or the "
-            f"name of one that comes with the package: {', '.join(shipped())}"
-        ) from None
-    except ValueError as error:
-        raise ConfigurationError(f"{folder / DESCRIPTION} is not JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise ConfigurationError(f"{folder / DESCRIPTION} must be a mapping, got {type(content).__name__}")
-    try:
-        return ResidualDescription(**content)
-    except ModelError as error:
-        raise ConfigurationError(f"{folder / DESCRIPTION} describes no residual: {error.named()}") from None
+    return load_json(
+        folder / DESCRIPTION, ResidualDescription, "residual",
+        lambda why: f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({why}), or the "
+        f"name of one that comes with the package: {', '.join(shipped())}",
+    )  # fmt: skip
 
 
 def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:

@@ -5,7 +5,7 @@ value raises an error that names the field, the unit, the bound and what was giv
 lists the keys that exist.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -17,6 +17,7 @@ from pydantic_core.core_schema import no_info_before_validator_function
 
 from elastic_env.core.config_problems import ModelError, problems_of
 from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.json_text import parse_json
 from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 
 ModelT = TypeVar("ModelT", bound="Model")
@@ -148,6 +149,32 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
         raise ConfigurationError(f"in {file}: {error.named()}") from None
     except ConfigurationError as error:
         raise ConfigurationError(f"in {file}: {error}") from None
+
+
+def load_json(path: Path, model: type[ModelT], what: str, missing: Callable[[str], str]) -> ModelT:
+    """Read a JSON file into a validated model.
+
+    Args:
+        path: The file.
+        model: What it becomes.
+        what: What the file describes, such as residual.
+        missing: What to say where it cannot be read, for a reason.
+
+    Raises:
+        ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the model.
+    """
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(missing(str(error.strerror))) from None
+    except ValueError as error:
+        raise ConfigurationError(f"{path} is not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{path} must be a mapping, got {type(content).__name__}")
+    try:
+        return model(**content)
+    except ModelError as error:
+        raise ConfigurationError(f"{path} describes no {what}: {error.named()}") from None
 
 
 def _text_of(file: Path) -> str:
