@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known, shown
 from elastic_env.rendering.picture import Picture
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 from elastic_env.runtime.task import Task
@@ -72,9 +72,7 @@ class Robot:
 
     def _configured(self, arguments: dict[str, Any]) -> Any:
         known = inspect.signature(self.configure).parameters
-        for name in arguments:
-            if name not in known:
-                raise unknown_name(f"argument of {self.id}", name, known)
+        require_known(f"argument of {self.id}", arguments, known)
         return self.configure(**arguments)
 
 

@@ -2,7 +2,7 @@
 
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any, ClassVar
 
 
@@ -83,6 +83,17 @@ def unknown_name(kind: str, name: object, choices: Iterable[str]) -> Configurati
         choices: The names that exist.
     """
     return ConfigurationError(f"unknown {kind} {shown(name)}; {choices_listed(name, choices)}")
+
+
+def require_known(kind: str, names: Iterable[str], choices: Collection[str]) -> None:
+    """Refuse names that do not exist; arguments as `unknown_name`.
+
+    Raises:
+        ConfigurationError: One of them is not among the choices.
+    """
+    for name in names:
+        if name not in choices:
+            raise unknown_name(kind, name, choices)
 
 
 def choices_listed(name: object, choices: Iterable[str]) -> str:

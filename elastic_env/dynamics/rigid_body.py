@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pinocchio
 
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 
 
@@ -147,9 +147,7 @@ def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequen
     for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:
             raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; trees of hinges are needed")
-    for joint in joints:
-        if joint not in names:
-            raise unknown_name("joint of the rigid model", joint, names)
+    require_known("joint of the rigid model", joints, names)
     if sorted(joints) != sorted(names):
         raise ConfigurationError(
             f"all {len(names)} joints must be named ({', '.join(names)}), got {len(joints)}: {', '.join(joints)}"

@@ -19,7 +19,7 @@ from typing import Literal, get_args
 import mujoco
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import link_name, motor_name, servo_name, spring_name
@@ -76,10 +76,8 @@ def transformed(
     spec: mujoco.MjSpec, joints: Mapping[str, ElasticJoint], form: Form = "tendon", actuators: ActuatorRule = "keep"
 ) -> mujoco.MjSpec:
     """`make_elastic` for a caller that chooses integrator and physics step later, and looks at their stability then."""
-    if form not in get_args(Form):
-        raise unknown_name("form", form, get_args(Form))
-    if actuators not in get_args(ActuatorRule):
-        raise unknown_name("actuator rule", actuators, get_args(ActuatorRule))
+    require_known("form", [form], get_args(Form))
+    require_known("actuator rule", [actuators], get_args(ActuatorRule))
     elastic = spec.copy()
     keyframes = take_keyframes(elastic)
     _resolve_springdampers(elastic, list(joints))
@@ -121,8 +119,7 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
 
 def _hinge(spec: mujoco.MjSpec, name: str) -> mujoco.MjsJoint:
     hinges = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE and j.name]
-    if name not in hinges:
-        raise unknown_name("hinge", name, hinges)
+    require_known("hinge", [name], hinges)
     taken = {j.name for j in spec.joints} | {t.name for t in spec.tendons} | {a.name for a in spec.actuators}
     taken |= {motor_name(name)} & {b.name for b in spec.bodies}
     for derived in (motor_name(name), spring_name(name), servo_name(name), link_name(name)):

@@ -39,7 +39,16 @@ def _require_short(duration_s: float) -> None:
         )
 
 
-class Hold(Model):
+class _Motion(Model):
+    """What all references share: one that is drawn has a seed, None for a new plan per episode."""
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return getattr(self, "seed", 0) is None
+
+
+class Hold(_Motion):
     """The paper's static positions, evenly spaced in gravity torque, approached from below and then from above.
 
     Without compensation the link sags below its reference; the references lie so far beyond the positions that the
@@ -89,11 +98,6 @@ class Hold(Model):
         directions = np.repeat(np.array([1, -1]), len(angles))
         return np.concatenate([angles, angles[::-1]]), directions
 
-    @property
-    def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
-        return False
-
     def extent(self) -> Extent:
         """See `Extent`."""
         angles = self.angles
@@ -137,7 +141,7 @@ class Hold(Model):
         return Plan(q, q_dot, q_ddot, rest >= 0, rest)
 
 
-class _Oscillation(Model):
+class _Oscillation(_Motion):
     """What sine and multisine share: amplitude, an envelope that starts smoothly, a duration."""
 
     amplitude: float = quantity("rad", 0.5, gt=0, lt=np.pi, description="largest angle from the middle")
@@ -176,11 +180,6 @@ class Sine(_Oscillation):
 
     kind: Literal["sine"] = "sine"
     frequency_hz: float = quantity("Hz", 0.25, gt=0, description="frequency")
-
-    @property
-    def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
-        return False
 
     def extent(self) -> Extent:
         """See `Extent`."""
@@ -227,11 +226,6 @@ class Multisine(_Oscillation):
     def _omega(self) -> Array:
         return 2.0 * np.pi * np.linspace(self.lowest_hz, self.highest_hz, self.components)
 
-    @property
-    def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
-        return self.seed is None
-
     def extent(self) -> Extent:
         """See `Extent`."""
         share = self.amplitude / self.components
@@ -249,7 +243,7 @@ class Multisine(_Oscillation):
         return self._enveloped(t, x, x_dot, x_ddot)
 
 
-class Steps(Model):
+class Steps(_Motion):
     """Quick moves between random levels, each followed by a rest."""
 
     kind: Literal["steps"] = "steps"
@@ -266,11 +260,6 @@ class Steps(Model):
     def _ends_in_time(self) -> Self:
         _require_short(STAND_S + self.moves * (self.move_s + self.rest_s))
         return self
-
-    @property
-    def is_random(self) -> bool:
-        """Whether every episode has a plan of its own."""
-        return self.seed is None
 
     def extent(self) -> Extent:
         """See `Extent`."""

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.draws import Draws
-from elastic_env.core.errors import unknown_name
+from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
 from elastic_env.core.state import Stateful
 from elastic_env.runtime.scenario import Scenario
@@ -122,9 +122,7 @@ class FurtherSensors(Stateful):
         counts_per_turn: int | None,
         num_worlds: int,
     ) -> None:
-        for name in names:
-            if name not in SENSORS:
-                raise unknown_name("sensor", name, SENSORS)
+        require_known("sensor", names, SENSORS)
         self._sensors = {name: SENSORS[name] for name in names}
         self._scenario = scenario
         self._counts = counts_per_turn if scenario.encoder_counts else None

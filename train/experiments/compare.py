@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, quantity
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known, shown
 from train.evaluate.cells import CellsFailedError, run_conditions
 from train.evaluate.changes import changes, merged
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
@@ -110,12 +110,9 @@ class CompareConfig(Model):
         _require_each_once("scenario", self.scenarios)
         require_drawn(self.scenarios, self.ranges)
         _require_each_once("value of the sweep", self.sweep.values if self.sweep else [])
-        for title in self.figure_policies:
-            if title not in titles:
-                raise unknown_name("policy of the figures", title, titles)
+        require_known("policy of the figures", self.figure_policies, titles)
+        require_known("scenario with episodes of its own", self.scenario_episodes, self.scenarios)
         for scenario, episodes in self.scenario_episodes.items():
-            if scenario not in self.scenarios:
-                raise unknown_name("scenario with episodes of its own", scenario, self.scenarios)
             if not 1 <= episodes <= MOST_EPISODES:
                 raise ConfigurationError(
                     f"scenario_episodes of {scenario!r} must be >= 1 and <= {MOST_EPISODES}, got {shown(episodes)}"
@@ -127,22 +124,17 @@ class CompareConfig(Model):
                     f"group {name!r} must have a name that no scenario has, and scenarios, each once; "
                     f"got {shown(scenarios)}"
                 )
-            for scenario in scenarios:
-                if scenario not in self.scenarios:
-                    raise unknown_name(f"scenario of the group {name!r}", scenario, self.scenarios)
+            require_known(f"scenario of the group {name!r}", scenarios, self.scenarios)
         return self
 
     def _require_reference_scenarios(self) -> None:
         """Refuse scenarios of references that are not played, and a leaderboard of what none can be of."""
+        require_known("reference with scenarios of its own", self.reference_scenarios, self._reference_names())
         for name, scenarios in self.reference_scenarios.items():
-            if name not in self._reference_names():
-                raise unknown_name("reference with scenarios of its own", name, self._reference_names())
             if not scenarios:
                 raise ConfigurationError(f"reference_scenarios of {name!r} must have a scenario; or leave out {name!r}")
             _require_each_once(f"scenario of {name!r}", scenarios)
-            for scenario in scenarios:
-                if scenario not in self.scenarios:
-                    raise unknown_name(f"scenario of {name!r}", scenario, self.scenarios)
+            require_known(f"scenario of {name!r}", scenarios, self.scenarios)
         if self.leaderboard and (self.sweep is not None or self.map is not None or environment(self.env).is_real):
             raise ConfigurationError("a leaderboard is of simulated cells without a sweep or a map; leave these out")
 

@@ -16,7 +16,7 @@ from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, load_yaml
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.running import RunningEmulator
@@ -142,7 +142,7 @@ def run(
         Folder of log.csv and metrics.json.
     """
     env: Any = gymnasium.make(environment("hardware").id, disable_env_checker=True, reference=reference, **arguments)
-    try:
+    with contextlib.closing(env):
         who = make_policy(policy, env)
         configuration = {"policy": policy.model_dump(mode="json"), "reference": reference, **arguments}
         with run_folder("hardware", configuration, None, output) as folder:
@@ -153,8 +153,6 @@ def run(
                     metrics = info.get("episode_metrics", metrics)
             (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
             return folder
-    finally:
-        env.close()
 
 
 def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
@@ -228,9 +226,7 @@ def require_switches(names: Sequence[str]) -> None:
         ConfigurationError: There is no such one.
     """
     switches = [name for name, field in Faults.model_fields.items() if field.annotation is bool]
-    for name in names:
-        if name not in switches:
-            raise unknown_name("fault", name, switches)
+    require_known("fault", names, switches)
 
 
 def emulate(

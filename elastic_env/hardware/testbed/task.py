@@ -96,15 +96,11 @@ class HardwareTestbedTask(TestbedTask):
 
     def sample(self) -> HardwareSample:
         """See `TestbedTask`."""
-        measured, timing = super().sample(), self._timing
+        measured = super().sample()
         return HardwareSample(
             *(getattr(measured, field.name) for field in fields(JointSample)),
             motor_torque=self._motor_torque.copy(),
-            jitter_s=np.array([timing.jitter_s]),
-            period_s=np.array([timing.period_s]),
-            overruns=np.array([timing.overruns]),
-            missed_replies=np.array([timing.missed_replies]),
-            limited=np.array([timing.limited]),
+            **{name: np.array([value]) for name, value in vars(self._timing).items()},
         )
 
     def signals(self, sample: JointSample) -> Signals:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known, shown
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.gait import Gait, make_gait
 from elastic_env.registration import Robot, require_models
@@ -59,9 +59,7 @@ def configure_walk(
         raise ConfigurationError(
             f"gait must be a mapping of {', '.join(_GAIT)}, got {shown(gait)}; see also step_period"
         )
-    for name in gait or {}:
-        if name not in _GAIT:
-            raise unknown_name("parameter of gait beside step_period and num_steps", name, _GAIT)
+    require_known("parameter of gait beside step_period and num_steps", gait or {}, _GAIT)
     chosen = robot if isinstance(robot, Thormang) else Thormang(**(robot or {}))
     if isinstance(joint, ElasticJoint):
         joints = dict.fromkeys(chosen.joints, joint)
