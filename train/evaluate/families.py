@@ -126,20 +126,17 @@ def origin(members: Sequence[Member]) -> Origin:
 
 def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]:
     """Folders of a pattern in natural order, with training seed and description; shipped ones where none lie there."""
-    if not _WILD.search(pattern):
-        folder = Path(pattern)
-        description = read_description(folder)
-        return [(folder, _training_seed(folder, description), description)]
-    anchor = Path(pattern).anchor
-    found = [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
-    folders = sorted(found or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
-    if not folders:
-        raise ConfigurationError(f"no folder matches {pattern!r}; {_nearest(Path(pattern))}")
-    members = []
-    for folder in folders:
-        description = read_description(folder)
-        members.append((folder, _training_seed(folder, description), description))
-    _require_one_family(pattern, members)
+    is_family, folders = bool(_WILD.search(pattern)), [Path(pattern)]
+    if is_family:
+        anchor = Path(pattern).anchor
+        found = [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
+        folders = sorted(found or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
+        if not folders:
+            raise ConfigurationError(f"no folder matches {pattern!r}; {_nearest(Path(pattern))}")
+    descriptions = [read_description(folder) for folder in folders]
+    members = [(f, _training_seed(f, said), said) for f, said in zip(folders, descriptions, strict=True)]
+    if is_family:
+        _require_one_family(pattern, members)
     return members
 
 
@@ -216,12 +213,15 @@ def _plays(known: PolicySpec, description: ResidualDescription, residual: Policy
 
 def _base(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec:
     """The base of a residual as a policy of its own, under a title that nobody has."""
-    titles = {policy.title for policy in taken}
-    label = None if description.base not in titles else f"{description.base} (base of {residual.title})"
-    return PolicySpec(
-        name=description.base, label=label, options=_base_options(description, residual),
-        env_options=residual.env_options, level=residual.level,
-    )  # fmt: skip
+    options = _base_options(description, residual)
+    return _beside(residual, taken, description.base, f"base of {residual.title}", options)
+
+
+def _beside(residual: PolicySpec, taken: Sequence[PolicySpec], name: str, role: str, options: dict[str, object]
+            ) -> PolicySpec:  # fmt: skip
+    """Whom a residual is compared with, under its name, or where a policy is called so under one that says its role."""
+    label = f"{name} ({role})" if name in {policy.title for policy in taken} else None
+    return PolicySpec(name=name, label=label, options=options, env_options=residual.env_options, level=residual.level)
 
 
 def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
@@ -239,11 +239,7 @@ def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequen
         same = policy.env_options == residual.env_options and policy.level == residual.level
         if policy.name == name and mine == assumed and same:
             return policy
-    titles = {policy.title for policy in taken}
-    return PolicySpec(
-        name=name, label=f"{name} (best analytic)" if name in titles else None, options=assumed,
-        env_options=residual.env_options, level=residual.level,
-    )  # fmt: skip
+    return _beside(residual, taken, name, "best analytic", assumed)
 
 
 def _base_options(description: ResidualDescription, residual: PolicySpec) -> dict[str, object]:

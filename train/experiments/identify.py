@@ -136,22 +136,16 @@ def identified_environments(config: IdentifyConfig) -> list[Any]:
     pendulums = [pendulum]
     if config.second_mass is not None:
         pendulums.append(pendulum.with_mass_scaled(config.second_mass))
-    if hardware:
-        return [
-            gymnasium.make_vec(
-                "elastic_env/HardwareTestbed-v0", num_envs=1, vectorization_mode="vector_entry_point",
-                reference=reference, pendulum=pendulum, **hardware,
-            )
-            for pendulum in pendulums
-        ]  # fmt: skip
+    where, given = "elastic_env/HardwareTestbed-v0", {"num_envs": 1, **hardware}
+    if not hardware:
+        where = "elastic_env/Testbed-v0"
+        given = {"num_envs": config.repeats, "scenario": config.scenario, "stiffness": config.stiffness}
     return [
         gymnasium.make_vec(
-            "elastic_env/Testbed-v0", num_envs=config.repeats, vectorization_mode="vector_entry_point",
-            reference=reference, scenario=config.scenario,
-            stiffness=config.stiffness, pendulum=pendulum,
+            where, vectorization_mode="vector_entry_point", reference=reference, pendulum=pendulum, **given
         )
         for pendulum in pendulums
-    ]  # fmt: skip
+    ]
 
 
 def _spread(results: Sequence[Identification], truth: float) -> str:

@@ -163,17 +163,13 @@ def _next_free(name: str) -> Path:
 def _empty(folder: Path) -> Path:
     if folder.exists() and not folder.is_dir():
         raise ResultsExistError(f"{folder} is a file; name a folder that is new or empty")
-    if _holds_results(folder):
+    if folder.exists() and any(folder.iterdir()):
         raise ResultsExistError(
             f"{folder} already holds results ({', '.join(sorted(p.name for p in folder.iterdir())[:3])}, ...), "
             "which are never overwritten; name another folder, or leave --output out"
         )
     folder.mkdir(parents=True, exist_ok=True)
     return folder
-
-
-def _holds_results(folder: Path) -> bool:
-    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
 def provenance(seed: int | None) -> dict[str, Any]:
