@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from baselines.compensation.inputs import COMMAND, DEFLECTION, INPUTS
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, quantity
-from elastic_env.core.errors import choices_listed, shown
+from elastic_env.core.errors import require_known, shown
 
 Bound = float | dict[str, float]
 """Value at a residual of 1: for all columns of an input, or by joint or axis."""
@@ -59,9 +59,8 @@ class ResidualSettings(Model):
 
     @model_validator(mode="after")
     def _inputs_exist_within_their_bounds(self) -> Self:
+        require_known("input", self.acts_on, INPUTS)
         for name, bound in self.acts_on.items():
-            if name not in INPUTS:
-                raise ValueError(f"unknown input {shown(name)}; {choices_listed(name, INPUTS)}")
             kind = INPUTS[name]
             given = bound.values() if isinstance(bound, dict) else [kind.default if bound is None else bound]
             if not given or not all(0.0 < one < kind.limit for one in given):

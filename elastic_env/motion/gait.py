@@ -27,6 +27,7 @@ TRANSITION_S = 0.2
 LONGEST_WALK_S = 600.0
 """Longest walk that is planned, with standing [s]: its tables hold every control step."""
 
+_DURATIONS = ("double_support_s", "single_support_s", "last_double_support_s")
 _RAMP_SHIFT_S = 0.1
 _RAMP_INWARD_M = 0.02
 
@@ -87,8 +88,7 @@ def make_gait(step_period: "float | tuple[float, float, float] | list[float] | G
             f"step_period must be one of {known} [s], or the three durations of double, single and double support [s] "
             f"such as [0.8, 0.6, 0.8]; got {shown(step_period)}"
         )
-    names = ("double_support_s", "single_support_s", "last_double_support_s")
-    return Gait(**dict(zip(names, durations, strict=True)), **parameters)
+    return Gait(**dict(zip(_DURATIONS, durations, strict=True)), **parameters)
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,8 @@ def step_timing(gait: Gait, control_period_s: float) -> Timing:
     Raises:
         ConfigurationError: A duration is no multiple of the control period, or the walk is too long.
     """
-    names = ("double_support_s", "single_support_s", "last_double_support_s")
-    first, single, _ = (_whole_steps(name, getattr(gait, name), control_period_s) for name in names)
-    period = sum(_whole_steps(name, getattr(gait, name), control_period_s) for name in names)
+    first, single, last = (_whole_steps(name, getattr(gait, name), control_period_s) for name in _DURATIONS)
+    period = first + single + last
     _require_short(gait)
     time = control_times(gait.duration_s, control_period_s)
     begin = round(STAND_S / control_period_s)

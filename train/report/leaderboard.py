@@ -16,10 +16,11 @@ from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
 from train.runs.escaping import markdown_table, markdown_text, write_csv
 
+_BASE = ("base", "change", "change_low", "change_high", "verdict")
+_RIVAL = ("best_without_learning", "change_to_best", "change_to_best_low", "change_to_best_high", "verdict_to_best")
 _HEAD = (
     "track", "policy", "reference", "scope", "pooled", "column", "title", "metric", "mean", "low", "high", "failed",
-    "episodes", "training_seeds", "base", "change", "change_low", "change_high", "verdict", "best_without_learning",
-    "change_to_best", "change_to_best_low", "change_to_best_high", "verdict_to_best", "step_us",
+    "episodes", "training_seeds", *_BASE, *_RIVAL, "step_us",
 )  # fmt: skip
 
 
@@ -282,9 +283,7 @@ def _standing(row: Mapping[str, str]) -> Standing:
         is_group=row["pooled"] == "True", is_column=row["column"] == "True", title=row["title"], metric=row["metric"],
         score=_estimate(row["mean"], row["low"], row["high"]), failed=int(row["failed"]),
         episodes=int(row["episodes"]), training_seeds=int(row["training_seeds"]),
-        base=_read_paired([row[n] for n in ("base", "change", "change_low", "change_high", "verdict")]),
-        rival=_read_paired([row[n] for n in ("best_without_learning", "change_to_best", "change_to_best_low",
-                                             "change_to_best_high", "verdict_to_best")]),
+        base=_read_paired([row[name] for name in _BASE]), rival=_read_paired([row[name] for name in _RIVAL]),
         step_us=float(row["step_us"]),
     )  # fmt: skip
 
