@@ -17,15 +17,14 @@ from tests.test_walk_policies import PERIOD_S, first, scalar
 GAINS = PostureGains(proportional=1.5, integral=2.0, derivative=0.1, leak_s=0.5, limit_rad=0.2)
 
 
-def turned(attitude: Array, rate: Array, seconds: float, gains: PostureGains = GAINS, share: float = 0.5) -> Array:
-    """Offsets under a constant attitude and rate of the IMU and a constant share on the right foot, (steps, 12)."""
+def turned(attitude: Array, rate: Array, seconds: float, gains: PostureGains = GAINS) -> Array:
+    """Offsets under a constant attitude and rate of the IMU, (steps, 12)."""
     env = scalar()
     model = env.unwrapped.assumed_model
     table, observation = model.observation_table, first(env)
     policy = PostureFeedback(Zero(table), model, gains, ramp_s=PERIOD_S)
     observation[table.group("imu_attitude")] = attitude
     observation[table.columns("imu_rate.x", "imu_rate.y")] = rate
-    observation[table.group("load_share")] = share
     state, actions = None, []
     for step in range(round(seconds / PERIOD_S)):
         action, state = policy.predict(observation, state, step == 0)
@@ -59,16 +58,6 @@ def test_the_response_is_that_of_the_equation() -> None:
     assert not found[:, [0, 2, 3, 4, 5]].any()
     with_rate = turned(np.array([tilt, 0.0]), np.array([0.05, 0.0]), seconds, gains)[-1].reshape(2, 6)
     np.testing.assert_allclose(with_rate[:, 1] - found[:, 1], gains.derivative * 0.05, rtol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("share", "left", "right"), [(0.0, 1.0, 0.0), (0.2, 1.0, 0.4), (0.5, 1.0, 1.0), (1.0, 0.0, 1.0)]
-)
-def test_a_leg_turns_as_far_as_it_stands(share: float, left: float, right: float) -> None:
-    """Catches a leg in the air that is turned, or the legs exchanged."""
-    both = turned(np.array([0.01, 0.02]), np.zeros(2), 0.2)[-1].reshape(2, 6)
-    found = turned(np.array([0.01, 0.02]), np.zeros(2), 0.2, share=share)[-1].reshape(2, 6)
-    np.testing.assert_allclose(found, both * np.array([[left], [right]]), atol=1e-8)
 
 
 def test_nothing_exceeds_the_limit() -> None:

@@ -2,11 +2,11 @@ r"""What is learned from trial to trial: which measured errors, and which offset
 
 | robot | error, by sensors alone | correction |
 |---|---|---|
-| walker | roll and pitch of the IMU | the same offset on the hip rolls, or hip pitches, of legs that stand |
+| walker | roll and pitch of the IMU | the same offset on both hip rolls, or on both hip pitches |
 | walker | planned less measured ZMP | another ZMP of the plan, see `baselines.walking.zmp_shift` |
 | joints | q_ref − q by link encoders, or by the IMU of the only link | the offset of the joint |
 
-A positive offset of the hip rolls turns the pelvis to a negative roll, so the error is the roll itself. The ZMP and
+A positive offset of both hip rolls turns the pelvis to a negative roll, so the error is the roll itself. The ZMP and
 the links follow their offsets, so their error is what was asked less what was measured.
 """
 
@@ -99,9 +99,7 @@ class WalkSignals:
 
     def offsets(self, table: Array) -> Array:
         """See `LearnedSignals`."""
-        planned = self._model.plan.share
-        share = planned[np.minimum(np.arange(len(table)), len(planned) - 1)]
-        return hip_offsets(table[:, :2], share) + zmp_shift_offsets(self._model, table[:, 2:])
+        return hip_offsets(table[:, :2]) + zmp_shift_offsets(self._model, table[:, 2:])
 
 
 class JointSignals:

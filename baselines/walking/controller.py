@@ -156,7 +156,7 @@ class WalkingController(PolicyWithInputs):
         lengthened = z if inputs.leg_length is None else z + inputs.leg_length
         moved = self._leg_offsets(rows, lengthened) + at_ankles
         if inputs.hip is not None:
-            moved = moved + hip_offsets(inputs.hip, np.full(len(rows), 0.5))  # both hips: the feet keep their places
+            moved = moved + hip_offsets(inputs.hip)
         action = share * moved + against_friction
         if planned.any():
             coming = np.minimum(row + 1, self._plan.num_steps)

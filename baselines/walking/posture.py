@@ -1,11 +1,11 @@
 r"""Posture feedback: the hips turn the pelvis back to level, by its IMU.
 
-The same offset u on the hip rolls, and on the hip pitches, of legs that stand turns the pelvis by −u:
+The same offset on both hip rolls, and on both hip pitches, turns the pelvis against legs that stand:
 
-.. math:: u = k_p \hat\varphi + k_i \int \hat\varphi \, dt + k_d \hat\omega, \quad u_i = \min(2 \mu_i, 1) \, u
+.. math:: u = k_p \hat\varphi + k_i \int \hat\varphi \, dt + k_d \hat\omega
 
-The planned load share μ_i of a leg says whether it stands. A leg in the air keeps its place under a level pelvis. With
-the offset it would land beside its foothold, and the ZMP would wander off with the feet.
+A leg in the air is turned as well. On a slope it lands where the ground is: turned on standing legs alone, the ZMP
+deviation in `slope` is 35 mm in the place of 13 mm.
 
 φ is the attitude of the IMU behind a first-order filter, ω its rate. The integral leaks, as it winds up against homing
 errors and the integrator of the foot force control else. Walking robots do this widely, also the published controller
@@ -24,7 +24,6 @@ from baselines.compensation.policy import Action, ObservationView, PolicyAround,
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.contact_force import shares
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -61,7 +60,6 @@ class PostureFeedback(PolicyAround):
         table, self._dt = model.observation_table, model.control_period_s
         self._view = ObservationView(table, self._dt)
         self._attitude, self._rate = table.group("imu_attitude"), table.columns("imu_rate.x", "imu_rate.y")
-        self._share = table.group("load_share")
         self._filter = 1.0 - float(np.exp(-self._dt / self._gains.filter_s))
         self._ramp = Ramp(model, ramp_s)
 
@@ -85,8 +83,7 @@ class PostureFeedback(PolicyAround):
         others = replace(inputs, posture_gain=None)
         action, inner = predicted(self._policy, observation, others, inner, episode_start, deterministic)
         turn, memory = self._turned(rows, memory, inputs.posture_gain)
-        offsets = hip_offsets(turn, rows[:, self._share][:, 0])
-        total = np.asarray(action, dtype=np.float64) + offsets.reshape(np.shape(action))
+        total = np.asarray(action, dtype=np.float64) + hip_offsets(turn).reshape(np.shape(action))
         return total.astype(np.float32), (memory, inner)
 
     def _turned(self, rows: Array, memory: Array, change: Array | None) -> tuple[Array, Array]:
@@ -110,14 +107,8 @@ class PostureFeedback(PolicyAround):
         return turn, np.hstack([steps, tilt, integral])
 
 
-def hip_offsets(turn: Array, share_right: Array) -> Array:
-    """Offsets of the joints, (n, 12) [rad], that turn the pelvis by −roll and −pitch, on legs that stand.
-
-    Args:
-        turn: Roll and pitch, (n, 2) [rad].
-        share_right: Planned load share of the right foot, (n,) [1].
-    """
-    standing = np.minimum(2.0 * shares(share_right), 1.0)
+def hip_offsets(turn: Array) -> Array:
+    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and −pitch, (n, 2) [rad]."""
     offsets = np.zeros((len(turn), 2, 6))
-    offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = standing * turn[:, [0]], standing * turn[:, [1]]
+    offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = turn[:, [0]], turn[:, [1]]
     return offsets.reshape(len(turn), 12)
