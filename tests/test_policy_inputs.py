@@ -292,6 +292,7 @@ def test_a_policy_plays_what_the_wrapper_decided_in_the_mirror() -> None:
         ("input", {"acts_on": {"hip": {}}}, r"bound of hip must be positive"),
         ("input", {"acts_on": {}}, r"at least 1"),
         ("input", {"space": "joints"}, r"space must be one of model, joint, got 'joints'"),
+        ("input", {"space": ["model"]}, r"space must be one of model, joint, got \['model'\]"),
         ("input", {"space": "model", "acts_on": {"zmp": 0.01}}, r"leave these two out"),
     ],
 )

@@ -52,7 +52,7 @@ class ResidualSettings(Model):
         if "acts_on" in values:
             raise ValueError("acts_on says what space and scale said before; leave these two out")
         space = values.get("space", "model")
-        if space not in _OLD_SPACES:
+        if not isinstance(space, str) or space not in _OLD_SPACES:
             raise ValueError(f"space must be one of {', '.join(_OLD_SPACES)}, got {shown(space)}; better give acts_on")
         others = {key: value for key, value in values.items() if key not in ("space", "scale")}
         return {**others, "acts_on": {_OLD_SPACES[space]: values.get("scale")}}
