@@ -287,7 +287,7 @@ def test_a_policy_plays_what_the_wrapper_decided_in_the_mirror() -> None:
         ("uncompensated", {"acts_on": {"posture_gain": 0.5}}, r"posture_gain.*has: command, zmp, com, leg_length"),
         ("thormang", {"acts_on": {"zmp": 0.01, "com": 0.01}}, r"acts on zmp, com, which StanceRoll"),
         ("input", {"acts_on": {"zpm": 0.01}}, r"unknown input 'zpm'.*zmp"),
-        ("input", {"acts_on": {"balance_gain": 1.0}}, r"balance_gain must be positive and below 1 1, got 1.0"),
+        ("input", {"acts_on": {"balance_gain": 1.0}}, r"balance_gain must be positive and below 1, got 1.0"),
         ("input", {"acts_on": {"zmp": {"x": 0.0}}}, r"bound of zmp must be positive"),
         ("input", {"acts_on": {"hip": {}}}, r"bound of hip must be positive"),
         ("input", {"acts_on": {}}, r"at least 1"),

@@ -64,9 +64,8 @@ class ResidualSettings(Model):
             kind = INPUTS[name]
             given = bound.values() if isinstance(bound, dict) else [kind.default if bound is None else bound]
             if not given or not all(0.0 < one < kind.limit for one in given):
-                raise ValueError(
-                    f"the bound of {name} must be positive and below {kind.limit:g} {kind.unit}, got {shown(bound)}"
-                )
+                limit = f"{kind.limit:g} {kind.unit}".removesuffix(" 1")
+                raise ValueError(f"the bound of {name} must be positive and below {limit}, got {shown(bound)}")
         return self
 
     @property
