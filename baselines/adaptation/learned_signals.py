@@ -28,6 +28,8 @@ from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 LINK_IMU = "link_angle_imu"
 _LEAST_LOAD = 0.15  # share of the weight below which there is no ZMP
 
+_ZMP = ChannelGains(gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1, halved_after=3.0)
+
 
 class LearningGains(Model):
     """How the offsets of `iterative` are learned."""
@@ -35,13 +37,9 @@ class LearningGains(Model):
     trials: int = quantity("1", 10, ge=1, le=1000, description="trials, such as walks, that it learns from")
     attitude: ChannelGains = ChannelGains(gain=2.0, lead_s=0.032, cutoff_hz=6.0, surprise=1.5e-3, limit=0.08)
     """Walker: hip angle per tilt of the pelvis [1], in rad."""
-    zmp_x: ChannelGains = ChannelGains(
-        gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1, halved_after=3.0
-    )
+    zmp_x: ChannelGains = _ZMP
     """Walker: forward shift of the planned ZMP per deviation of the ZMP [1], in m."""
-    zmp_y: ChannelGains = ChannelGains(
-        gain=0.6, lead_s=0.26, cutoff_hz=2.0, surprise=0.006, limit=0.06, forgetting=0.1, halved_after=3.0
-    )
+    zmp_y: ChannelGains = _ZMP
     """Walker: the same to the left."""
     joint: ChannelGains = ChannelGains(gain=0.5, lead_s=0.08, cutoff_hz=1.4, surprise=0.01, limit=0.2)
     """Robots on a fixed base: offset per error of the link [1], in rad."""

@@ -181,11 +181,8 @@ def _drawn(ranges: RobotRanges, number: int, joints: int, seed: Sequence[int]) -
     homing, mounting = within("homing_rad", joints), within("mounting_rad", 2)
     place = np.hstack([within("load_x_m"), within("load_y_m"), within("load_z_m")])
     push = within("push_n")[:, 0] * has("push_share")
-    direction, delayed, inertial = (
-        2.0 * np.pi * unit("slope_direction")[:, 0],
-        has("delay_share"),
-        has("inertial_share"),
-    )
+    direction = 2.0 * np.pi * unit("slope_direction")[:, 0]
+    delayed, inertial = has("delay_share"), has("inertial_share")
     one_each = {
         "damping_factor": "damping", "friction_factor": "friction", "backlash_rad": "backlash_rad",
         "load_kg": "load_kg", "slope_rad": "slope_rad",
