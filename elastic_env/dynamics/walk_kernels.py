@@ -38,11 +38,14 @@ class Walker(NamedTuple):
         constants: Addresses, feet, sensors and rules: rows of `CONSTANTS`, one for every kind of sensors.
         plan: One row per control step.
         bias: Errors of homing and mounting, and which row of the constants holds, (n,).
+        inertial: Rows of `INERTIAL` beside the constants, or None where no robot has such an IMU: its filter is then
+            not even compiled.
     """
 
     constants: Any
     plan: Any
     bias: Any
+    inertial: Any
 
 
 class Noise(NamedTuple):
@@ -82,10 +85,9 @@ def begin(physics: Any, walker: Any, noise: Any, worlds: BoolArray, rows: Any) -
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
             drawn = sample_of(noise, world)
-            if constants.quality.inertial.is_fitted:
-                settle_imu(truth, drawn, bias, constants.quality, shown)
+            settle_imu(walker.inertial, truth, drawn, bias, constants.quality, shown)
             imu_is_due = row_of(walker.plan, truth.step).imu_is_due  # as always at first
-            measure(truth, drawn, bias, constants.quality, imu_is_due, shown)
+            measure(walker.inertial, truth, drawn, bias, constants.quality, imu_is_due, shown)
             for i in range(len(shown.encoder)):
                 shown.encoder_before[i] = shown.encoder[i]
 
@@ -125,9 +127,8 @@ def control_step(
             read(physics, constants.at, world, truth)
             stand(physics, constants, world, truth, feet)
             drawn = sample_of(noise, world)
-            if constants.quality.inertial.is_fitted:
-                advance_imu(last[world].truth, truth, drawn, bias, constants, shown)
-            measure(truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
+            advance_imu(walker.inertial, last[world].truth, truth, drawn, bias, constants, shown)
+            measure(walker.inertial, truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
         watch_swing_foot(truth, planned, rules.loaded_n)
         is_last = truth.step >= len(walker.plan) - 1
         is_over = end(truth, rules, diverged[world], is_last, outcome.ends[:, world]) or is_over
@@ -238,7 +239,7 @@ def watch_swing_foot(row: Any, planned: Any, loaded_n: float) -> None:
 
 
 @compiled
-def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, shown: Any) -> None:
+def measure(inertial: Any, row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, shown: Any) -> None:
     """What encoders, IMU and foot sensors show; an IMU that is not due shows its last sample."""
     for i in range(len(shown.encoder)):
         shown.encoder_before[i] = shown.encoder[i]
@@ -249,8 +250,7 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
             shown.wrench[foot, 0, i] = noise.wrench[foot, 0, i] * quality.noise.wrench[foot, 0, i] + force
             shown.wrench[foot, 1, i] = noise.wrench[foot, 1, i] * quality.noise.wrench[foot, 1, i] + moment
     if imu_is_due:
-        if quality.inertial.is_fitted:
-            show_inertial(bias, quality, shown)
+        if show_inertial(inertial, bias, quality, shown):
             return
         for i, angle in enumerate((row.roll, row.pitch)):
             drawn = quality.noise.imu_attitude[i] * noise.imu_attitude[i]
@@ -262,8 +262,12 @@ def measure(row: Any, noise: Any, bias: Any, quality: Any, imu_is_due: bool, sho
 
 
 @compiled
-def show_inertial(bias: Any, quality: Any, shown: Any) -> None:
-    """What an inertial IMU shows of its own state: noise is in it, errors of the mounting come on top."""
+def show_inertial(inertial: Any, bias: Any, quality: Any, shown: Any) -> bool:
+    """What an inertial IMU shows of its own state, and whether one is fitted: errors of the mounting come on top."""
+    if inertial is None:
+        return False
+    if not inertial[bias.fit].is_fitted:
+        return False
     roll, pitch, _ = attitude_by(shown.imu_up[0], shown.imu_up[1], shown.imu_up[2])
     for i, angle in enumerate((roll, pitch)):
         shown.imu_attitude[i] = shown_angle(
@@ -271,24 +275,30 @@ def show_inertial(bias: Any, quality: Any, shown: Any) -> None:
         )
     for i in range(3):
         shown.imu_rate[i] = shown.imu_gyro[i]
+    return True
 
 
 @compiled
-def settle_imu(row: Any, noise: Any, bias: Any, quality: Any, shown: Any) -> None:
+def settle_imu(inertial: Any, row: Any, noise: Any, bias: Any, quality: Any, shown: Any) -> None:
     """An inertial IMU that has been at rest for long: its filter has settled, a bias of the gyroscope included."""
-    inertial, force = quality.inertial, np.empty(3)
-    specific_force(row, row, 1.0, inertial.gravity_m_s2, force)
+    if inertial is None:
+        return
+    sensor, force = inertial[bias.fit], np.empty(3)
+    if not sensor.is_fitted:
+        return
+    specific_force(row, row, 1.0, sensor.gravity_m_s2, force)
     for i in range(3):
         force[i] += bias.specific_force[i]
         shown.imu_gyro[i] = bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
-    settled_vertical(shown.imu_up, force, bias.gyro, inertial.time_constant_s)
+    settled_vertical(shown.imu_up, force, bias.gyro, sensor.time_constant_s)
 
 
 @compiled
-def advance_imu(before: Any, row: Any, noise: Any, bias: Any, constants: Any, shown: Any) -> None:
+def advance_imu(inertial: Any, before: Any, row: Any, noise: Any, bias: Any, constants: Any, shown: Any) -> None:
     """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical by its filter.
 
     Args:
+        inertial: Rows of `INERTIAL`, or None.
         before: Truth at the beginning of the period.
         row: And at its end.
         noise: Sample of the sensors; that of the attitude is of the accelerometer, across the vertical.
@@ -296,18 +306,22 @@ def advance_imu(before: Any, row: Any, noise: Any, bias: Any, constants: Any, sh
         constants: One row of `CONSTANTS`.
         shown: Measurements, whose `imu_gyro` and `imu_up` are brought up to date.
     """
-    quality, period_s = constants.quality, constants.rules.control_period_s
+    if inertial is None:
+        return
+    sensor, quality, period_s = inertial[bias.fit], constants.quality, constants.rules.control_period_s
+    if not sensor.is_fitted:
+        return
     force, turned = np.empty(3), np.empty(3)
-    specific_force(before, row, period_s, quality.inertial.gravity_m_s2, force)
+    specific_force(before, row, period_s, sensor.gravity_m_s2, force)
     rotation_between(before.quaternion, row.quaternion, turned)
     # a force to the left is a positive roll, one forward a negative pitch
-    force[0] -= quality.inertial.gravity_m_s2 * quality.noise.imu_attitude[1] * noise.imu_attitude[1]
-    force[1] += quality.inertial.gravity_m_s2 * quality.noise.imu_attitude[0] * noise.imu_attitude[0]
+    force[0] -= sensor.gravity_m_s2 * quality.noise.imu_attitude[1] * noise.imu_attitude[1]
+    force[1] += sensor.gravity_m_s2 * quality.noise.imu_attitude[0] * noise.imu_attitude[0]
     for i in range(3):
         force[i] += bias.specific_force[i]
         rate = turned[i] / period_s + bias.gyro[i] + noise.imu_rate[i] * quality.noise.imu_rate[i]
         shown.imu_gyro[i], turned[i] = rate, rate * period_s
-    complementary_filter(shown.imu_up, turned, force, 1.0 - math.exp(-period_s / quality.inertial.time_constant_s))
+    complementary_filter(shown.imu_up, turned, force, 1.0 - math.exp(-period_s / sensor.time_constant_s))
 
 
 @compiled

@@ -85,13 +85,15 @@ ROW_OF_PLAN = record_type(
 """What a control step needs of the plan."""
 
 INERTIAL = record_type(("is_fitted", np.bool_), ("time_constant_s", REAL), ("gravity_m_s2", REAL))
-"""An inertial IMU; where none is fitted, the attitude comes with the errors that `QUALITY` has for it."""
+"""An inertial IMU, one row beside every row of `CONSTANTS`.
+
+Where none is fitted, the attitude comes with the errors that `QUALITY` has for it.
+"""
 
 QUALITY = record_type(
     ("count_rad", REAL),  # of the encoders, 0 for none
     ("noise", NOISE),  # standard deviations
     ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL),
-    ("inertial", INERTIAL),
 )  # fmt: skip
 """Quality of the sensors: noise and constant errors."""
 

@@ -165,11 +165,12 @@ class WalkTask(Stateful):
         self._constants = np.concatenate([
             one(
                 CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
-                quality=_quality(_fitted(config.scenario, is_inertial), counts, robot.gravity),
+                quality=_quality(_fitted(config.scenario, is_inertial), counts),
                 rules=_delayed(rules, is_delayed),
             )
             for is_delayed, is_inertial in self._fits
         ])  # fmt: skip
+        self._inertial = _inertial(config.scenario, [is_inertial for _, is_inertial in self._fits], robot.gravity)
         self._plan_rows = _plan_rows(self.plan, config)
         self._draw = np.zeros(n, dtype=np.int64)
         self._pushes = any(robot.push_n > 0.0 for robot in self._bank)
@@ -364,7 +365,7 @@ class WalkTask(Stateful):
     @property
     def _walker(self) -> tuple[Any, ...]:
         """`kernels.Walker`."""
-        return self._constants, self._plan_rows, self._bias
+        return self._constants, self._plan_rows, self._bias, self._inertial
 
     def _draw_push(self, world: int, draws: Draws) -> None:
         """Time and direction of the push, in the walk."""
@@ -470,19 +471,28 @@ def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
     return scenario.replace(ranges=(), inertial=scenario.inertial or InertialSensor())
 
 
-def _quality(scenario: Scenario, counts_per_turn: int | None, gravity_m_s2: float) -> Records:
+def _inertial(scenario: Scenario, is_fitted: Sequence[bool], gravity_m_s2: float) -> Records | None:
+    """The inertial IMUs of the robots, rows of `INERTIAL`; None where no robot has one."""
+    if not any(is_fitted):
+        return None
+    sensor = scenario.inertial or InertialSensor()
+    return np.concatenate(
+        [
+            one(INERTIAL, is_fitted=fitted, time_constant_s=sensor.time_constant_s, gravity_m_s2=gravity_m_s2)
+            for fitted in is_fitted
+        ]
+    )
+
+
+def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:
     """Quality of the sensors in a scenario, one row of `QUALITY`."""
     imu, noise = scenario.pelvis_imu, np.zeros(1, NOISE)
     for group in GROUPS:
         if group.noise is not None:
             noise[group.name] = group.noise(scenario)
-    inertial = one(
-        INERTIAL, is_fitted=scenario.inertial is not None, gravity_m_s2=gravity_m_s2,
-        time_constant_s=1.0 if scenario.inertial is None else scenario.inertial.time_constant_s,
-    )  # fmt: skip
     return one(
         QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None), noise=noise,
-        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad, inertial=inertial,
+        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
     )  # fmt: skip
 
 
