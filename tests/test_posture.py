@@ -66,6 +66,35 @@ def test_nothing_exceeds_the_limit() -> None:
     assert np.abs(turned(np.array([0.5, -0.5]), np.zeros(2), 0.4, gains)).max() == pytest.approx(0.03)
 
 
+def test_a_leg_in_the_air_keeps_its_pitch_and_follows_slowly() -> None:
+    """Catches a swing foot that is moved forth and back: n steps after lift-off (1 − Δt/T)ⁿ of the way is left."""
+    gains = GAINS.replace(integral=0.0, derivative=0.0, filter_s=1e-4, swing_s=0.5)
+    env = scalar()
+    model = env.unwrapped.assumed_model
+    table, observation = model.observation_table, first(env)
+    policy = PostureFeedback(Zero(table), model, gains, ramp_s=PERIOD_S)
+    attitude, share = table.group("imu_attitude"), table.group("load_share")
+    observation[table.columns("imu_rate.x", "imu_rate.y")] = 0.0
+    state, action, tilt, later = None, None, np.array([0.01, 0.02]), np.array([0.03, -0.01])
+
+    def played(seconds: float, imu: Array, share_right: float) -> Array:
+        nonlocal state, action
+        observation[attitude], observation[share] = imu, share_right
+        for _ in range(round(seconds / PERIOD_S)):
+            action, state = policy.predict(observation, state, state is None)
+        return np.asarray(action, dtype=np.float64).reshape(2, 6)
+
+    standing = played(0.1, tilt, 0.5)
+    np.testing.assert_allclose(standing[:, 1:3], gains.proportional * np.tile(tilt, (2, 1)), rtol=1e-5)
+    swing = played(0.3, later, 0.0)  # the left foot stands alone
+    now, lifted = gains.proportional * later, gains.proportional * tilt
+    np.testing.assert_allclose(swing[0, 1:3], now, rtol=1e-5)
+    left = (1.0 - PERIOD_S / gains.swing_s) ** (round(0.3 / PERIOD_S) - 1)
+    np.testing.assert_allclose(swing[1, 1:3], [now[0], now[1] + (lifted[1] - now[1]) * left], rtol=1e-4)
+    landed = played(PERIOD_S, later, 0.5)
+    np.testing.assert_allclose(landed[:, 1:3], np.tile(now, (2, 1)), rtol=1e-5)
+
+
 def pelvis_error(name: str, scenario: str, **options: Any) -> float:
     """Pelvis error rms of a walk of two fast steps [rad]."""
     env = gymnasium.make("elastic_env/WalkInPlace-v0", step_period=1.6, num_steps=2, scenario=scenario)

@@ -4,8 +4,9 @@ The same offset on both hip rolls, and on both hip pitches, turns the pelvis aga
 
 .. math:: u = k_p \hat\varphi + k_i \int \hat\varphi \, dt + k_d \hat\omega
 
-A leg in the air is turned as well. On a slope it lands where the ground is: turned on standing legs alone, the ZMP
-deviation in `slope` is 35 mm in the place of 13 mm.
+The hip roll of a leg in the air is turned as well, so that on a slope it lands where the ground is. Its hip pitch keeps
+the turn with which it left the ground, and follows u slowly: what the standing leg needs while it carries the robot
+alone would move the other foot forth and back.
 
 φ is the attitude of the IMU behind a first-order filter, ω its rate. The integral leaks, as it winds up against homing
 errors and the integrator of the foot force control else. Walking robots do this widely, also the published controller
@@ -24,6 +25,7 @@ from baselines.compensation.policy import Action, ObservationView, PolicyAround,
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
+from elastic_env.dynamics.contact_force import shares
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -38,13 +40,16 @@ class PostureGains(Model):
     derivative: float = quantity("s", 0.1, ge=0, description="hip angle per rate of the tilt")
     leak_s: float = quantity("s", 1.0, gt=0, description="time constant with which the integral leaks")
     filter_s: float = quantity("s", 0.02, gt=0, description="time constant of the attitude's filter")
+    swing_s: float = quantity(
+        "s", 0.5, gt=0, description="time constant with which the pitch of a leg in the air follows"
+    )
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
 
 class PostureFeedback(PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
 
-    Memory per world: steps, filtered roll and pitch, their integrals.
+    Memory per world: steps, filtered roll and pitch, their integrals, and the hip pitch that either leg keeps.
 
     Args:
         policy: What commands the robot.
@@ -60,6 +65,7 @@ class PostureFeedback(PolicyAround):
         table, self._dt = model.observation_table, model.control_period_s
         self._view = ObservationView(table, self._dt)
         self._attitude, self._rate = table.group("imu_attitude"), table.columns("imu_rate.x", "imu_rate.y")
+        self._share_right = table.group("load_share")
         self._filter = 1.0 - float(np.exp(-self._dt / self._gains.filter_s))
         self._ramp = Ramp(model, ramp_s)
 
@@ -78,13 +84,15 @@ class PostureFeedback(PolicyAround):
     ) -> tuple[Action, Any]:
         """See `PolicyWithInputs`; it takes `posture_gain`."""
         rows = self._view.rows(observation)
-        begun = np.zeros((len(rows), 5))
+        begun = np.zeros((len(rows), 7))
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
         others = replace(inputs, posture_gain=None)
         action, inner = predicted(self._policy, observation, others, inner, episode_start, deterministic)
-        turn, memory = self._turned(rows, memory, inputs.posture_gain)
-        total = np.asarray(action, dtype=np.float64) + hip_offsets(turn).reshape(np.shape(action))
-        return total.astype(np.float32), (memory, inner)
+        turn, tilts = self._turned(rows, memory[:, :5], inputs.posture_gain)
+        pitch, kept = self._pitch_of_legs(rows, turn[:, 1:], memory[:, 5:])
+        offsets = hip_offsets(np.stack([np.repeat(turn[:, :1], 2, axis=1), pitch], axis=-1))
+        total = np.asarray(action, dtype=np.float64) + offsets.reshape(np.shape(action))
+        return total.astype(np.float32), (np.hstack([tilts, kept]), inner)
 
     def _turned(self, rows: Array, memory: Array, change: Array | None) -> tuple[Array, Array]:
         """Turn of both hips against roll and pitch, (num_worlds, 2) [rad], and the new memory.
@@ -106,9 +114,28 @@ class PostureFeedback(PolicyAround):
         turn = self._ramp.share(steps) * np.clip(turn, -gains.limit_rad, gains.limit_rad)
         return turn, np.hstack([steps, tilt, integral])
 
+    def _pitch_of_legs(self, rows: Array, turn: Array, kept: Array) -> tuple[Array, Array]:
+        """Hip pitch of left and right leg, and what a leg in the air would keep, both (num_worlds, 2) [rad].
+
+        Args:
+            rows: Observations.
+            turn: That of standing legs, (num_worlds, 1) [rad].
+            kept: As returned before.
+        """
+        # a leg that carries half of the weight stands
+        standing = np.minimum(2.0 * shares(rows[:, self._share_right][:, 0]), 1.0)
+        pitch = kept + standing * (turn - kept)
+        following = np.where(standing < 1.0, self._dt / self._gains.swing_s, 1.0)
+        return pitch, kept + np.minimum(following, 1.0) * (turn - kept)
+
 
 def hip_offsets(turn: Array) -> Array:
-    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and −pitch, (n, 2) [rad]."""
+    """Offsets of the joints, (n, 12) [rad], that turn the pelvis of standing legs by −roll and −pitch.
+
+    Args:
+        turn: Roll and pitch of both hips, (n, 2), or of either, (n, 2, 2) [rad].
+    """
     offsets = np.zeros((len(turn), 2, 6))
-    offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = turn[:, [0]], turn[:, [1]]
+    of_legs = turn if turn.ndim == 3 else turn[:, None]
+    offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = of_legs[..., 0], of_legs[..., 1]
     return offsets.reshape(len(turn), 12)
