@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from train.commands.cli import main
 from train.learn.export import network_of
 from train.learn.sb3_env import SB3VecEnv
 
+ROOT = Path(__file__).parents[1]
 WALKER, TESTBED = "elastic_env/WalkInPlace-v0", "elastic_env/Testbed-v0"
 QUICK = {"step_period": [0.3, 0.4, 0.3], "num_steps": 1}
 SINE = {"reference": {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}}
@@ -332,7 +334,7 @@ def test_the_numpy_forward_pass_is_that_of_sb3(algorithm: Any, options: dict[str
     )
     save_residual(tmp_path / "r", description, tensors)
     read, network = load_residual(tmp_path / "r")
-    assert read == description
+    assert read.replace(weights_sha256=None) == description
     features = (
         np.random.default_rng(1).normal(size=(100, network.num_features)) * tensors["std"] * 3.0 + tensors["mean"]
     )
@@ -505,9 +507,11 @@ def test_make_reads_a_residual_and_runs_it_on_many_worlds(tmp_path: Path) -> Non
 
 
 def damaged(path: Path, **changes: Any) -> None:
-    """Change tensors of a residual; None leaves one out."""
+    """Change tensors of a residual, and leave out their digest; None leaves one out."""
     tensors = load_file(path / "weights.safetensors") | changes
     save_file({name: value for name, value in tensors.items() if value is not None}, path / "weights.safetensors")
+    description = ResidualDescription(**json.loads((path / "residual.json").read_text()))
+    (path / "residual.json").write_text(description.replace(weights_sha256=None).model_dump_json())
 
 
 @pytest.mark.parametrize(
@@ -526,6 +530,31 @@ def test_a_damaged_residual_says_what_is_wrong(changes: dict[str, Any], message:
     damaged(path, **changes)
     with pytest.raises(ConfigurationError, match=message):
         baselines.make(f"residual:{path}", scalar("testbed"))
+
+
+def test_weights_that_were_changed_are_refused(tmp_path: Path) -> None:
+    """Catches weights of another training beside the description of this one."""
+    path = folder(tmp_path / "r")
+    save_file(load_file(path / "weights.safetensors") | {"bias1": np.ones(1)}, path / "weights.safetensors")
+    with pytest.raises(ConfigurationError, match=r"weights\.safetensors was changed: residual\.json names the SHA-256"):
+        baselines.make(f"residual:{path}", scalar("testbed"))
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_residuals_of_the_package_are_those_that_a_commit_of_the_history_trained(name: str) -> None:
+    """Catches weights that were changed after training, or that code trained which nobody can look up."""
+    description, _ = load_residual(Path(name))
+    assert description.weights_sha256 is not None
+    assert description.origin.commit is not None
+    assert re.fullmatch("[0-9a-f]{40}", description.origin.commit), "trained by changes that were not committed"
+    if (ROOT / ".git").exists() and git("rev-parse", "--is-shallow-repository") == "false":
+        git("merge-base", "--is-ancestor", description.origin.commit, "HEAD")
+
+
+def git(*arguments: str) -> str:
+    """Output of git in this checkout; it must succeed."""
+    done = subprocess.run(["git", "-C", str(ROOT), *arguments], check=True, capture_output=True, text=True)
+    return done.stdout.strip()
 
 
 def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> None:

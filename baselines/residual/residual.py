@@ -4,6 +4,7 @@ A folder holds `residual.json` (base, settings, network, how it was trained) and
 no code from it and needs no torch. The observation is normalised in here; the base policy sees it as it is.
 """
 
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -62,6 +63,8 @@ class ResidualDescription(Model):
     output: Literal["clip", "tanh"] = "clip"
     """How the last layer comes to [−1, 1]: clipped (PPO), or by tanh (SAC)."""
     clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
+    weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """Digest of the weights; None for those of folders from before it was written."""
     training: dict[str, Any] = {}
     """How it was trained: configuration, seed, versions, commit."""
 
@@ -169,6 +172,7 @@ def save_residual(folder: Path, description: ResidualDescription, tensors: Tenso
     folder.mkdir(parents=True, exist_ok=True)
     weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
     (folder / WEIGHTS).write_bytes(weights)  # its own file writer has an error of its own for a full disk
+    description = description.replace(weights_sha256=sha256(weights).hexdigest())
     (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
@@ -206,9 +210,16 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     folder = located(folder)
     description, tensors = read_description(folder), read_tensors(folder / WEIGHTS)
     try:
-        return description, Network(description, tensors)
+        network = Network(description, tensors)
     except ConfigurationError as error:
         raise ConfigurationError(f"{folder / WEIGHTS} holds no network: {error}") from None
+    found = sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    if description.weights_sha256 not in (None, found):
+        raise ConfigurationError(
+            f"{folder / WEIGHTS} was changed: {DESCRIPTION} names the SHA-256 digest {description.weights_sha256}, "
+            f"it has {found}; copy it anew, or leave weights_sha256 out if you mean these weights"
+        )
+    return description, network
 
 
 def residual_policy(folder: Path, base: Policy, model: Any) -> ResidualPolicy:
