@@ -9,6 +9,7 @@ import elastic_env  # noqa: F401  first: it chooses MuJoCo's OpenGL before anyth
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import DynamicCompensator, GravityCompensator
 from baselines.compensation.policy import Policy
+from baselines.compensation.position_compensator import PositionCompensator
 from baselines.policies import RESIDUAL, make, policy_names
 from baselines.residual.correction import Corrected
 from baselines.residual.settings import ResidualSettings
@@ -21,6 +22,7 @@ __all__ = [
     "DynamicCompensator",
     "GravityCompensator",
     "Policy",
+    "PositionCompensator",
     "ResidualSettings",
     "ResidualVectorWrapper",
     "ResidualWrapper",

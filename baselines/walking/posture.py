@@ -41,7 +41,7 @@ class PostureGains(Model):
     leak_s: float = quantity("s", 1.0, gt=0, description="time constant with which the integral leaks")
     filter_s: float = quantity("s", 0.02, gt=0, description="time constant of the attitude's filter")
     swing_s: float = quantity(
-        "s", 0.5, gt=0, description="time constant with which the pitch of a leg in the air follows"
+        "s", 0.5, ge=0, description="time constant with which the pitch of a leg in the air follows"
     )
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
@@ -125,8 +125,8 @@ class PostureFeedback(PolicyAround):
         # a leg that carries half of the weight stands
         standing = np.minimum(2.0 * shares(rows[:, self._share_right][:, 0]), 1.0)
         pitch = kept + standing * (turn - kept)
-        following = np.where(standing < 1.0, self._dt / self._gains.swing_s, 1.0)
-        return pitch, kept + np.minimum(following, 1.0) * (turn - kept)
+        following = np.where(standing < 1.0, self._dt / max(self._gains.swing_s, self._dt), 1.0)
+        return pitch, kept + following * (turn - kept)
 
 
 def hip_offsets(turn: Array) -> Array:

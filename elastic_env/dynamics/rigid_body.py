@@ -4,7 +4,7 @@ The only file that imports pinocchio. Kinematic tree and inertias are taken from
 precision (its XML output has six digits); the algorithms are Pinocchio's.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -18,16 +18,19 @@ class RigidBody:
     """A fixed-base tree of hinges, on (..., n) joint angles in a chosen order.
 
     Args:
-        model: Compiled rigid model; its joints must all be hinges.
-        joints: All hinges of the model, in the order of the last axis.
+        model: Compiled rigid model.
+        joints: Hinges of the model, in the order of the last axis.
+        held: Position of every other joint, a hinge [rad] or a slide [m].
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
 
-    def __init__(self, model: mujoco.MjModel, joints: Sequence[str]) -> None:
-        require_hinge_tree(model, joints)
-        self._model = _convert(model)
+    def __init__(self, model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, float] | None = None) -> None:
+        held = held or {}
+        require_hinge_tree(model, joints, but=list(held))
+        self._model, self._carriers = _convert(model, held)
+        self._bare: list[pinocchio.Inertia] = [inertia.copy() for inertia in self._model.inertias]
         self._data = self._model.createData()
         self._columns = np.array([self._model.joints[self._model.getJointId(joint)].idx_v for joint in joints])
         self._square = np.ix_(self._columns, self._columns)
@@ -50,6 +53,20 @@ class RigidBody:
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (..., n) [N·m]."""
         return self._rows(lambda *rows: pinocchio.rnea(self._model, self._data, *rows), q - self._zero, q_dot, q_ddot)
+
+    def set_load(self, body: int, mass: float, place: Array) -> None:
+        """Let a body carry one point mass, in the place of the last one.
+
+        Args:
+            body: Number of the body in MuJoCo's model.
+            mass: Of the load, 0 for none [kg].
+            place: In the frame of the body, (3,) [m].
+        """
+        carrier, T_joint_body = self._carriers[body]
+        for joint, inertia in enumerate(self._bare):
+            self._model.inertias[joint] = inertia
+        load = pinocchio.Inertia(mass, T_joint_body.act(place), np.zeros((3, 3)))
+        self._model.inertias[carrier] = self._bare[carrier] + load
 
     def _rows(self, function: Callable[..., Array], *arrays: Array) -> Array:
         n = arrays[0].shape[-1]
@@ -81,7 +98,7 @@ class FloatingBody:
         if len(free) != 1:
             raise ConfigurationError(f"a floating robot needs one free joint, this model has {len(free)}")
         require_hinge_tree(model, joints, but=free)
-        self._model = _convert(model)
+        self._model, _ = _convert(model)
         self._data = self._model.createData()
         base = self._model.joints[self._model.getJointId(free[0])]
         names = [self._model.joints[self._model.getJointId(joint)] for joint in joints]
@@ -154,8 +171,15 @@ def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequen
         )
 
 
-def _convert(model: mujoco.MjModel) -> pinocchio.Model:
-    """Pinocchio's model of a MuJoCo tree of hinges, with or without a free base."""
+def _convert(
+    model: mujoco.MjModel, held: Mapping[str, float] | None = None
+) -> tuple[pinocchio.Model, dict[int, tuple[int, pinocchio.SE3]]]:
+    """Pinocchio's model of a MuJoCo tree of hinges, with or without a free base, and some joints held in place.
+
+    Returns:
+        The model, and of every body of MuJoCo the joint that carries it and its pose in the frame of that joint.
+    """
+    held = held or {}
     tree = pinocchio.Model()
     tree.gravity.linear = model.opt.gravity.copy()
     joint_of = {0: 0}  # MuJoCo body -> Pinocchio joint that carries it
@@ -165,6 +189,9 @@ def _convert(model: mujoco.MjModel) -> pinocchio.Model:
         T = T_joint_body[parent] * _placement(model.body_pos[b], model.body_quat[b])
         carrier = joint_of[parent]
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
+            if model.joint(j).name in held:
+                T *= _displacement(model, j, held[model.joint(j).name])
+                continue
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
                 freeflyer = pinocchio.JointModelFreeFlyer()
                 carrier = tree.addJoint(carrier, freeflyer, pinocchio.SE3.Identity(), model.joint(j).name)
@@ -178,7 +205,17 @@ def _convert(model: mujoco.MjModel) -> pinocchio.Model:
         T_body_com = _placement(model.body_ipos[b], model.body_iquat[b])
         inertia = pinocchio.Inertia(float(model.body_mass[b]), np.zeros(3), np.diag(model.body_inertia[b]))
         tree.appendBodyToJoint(carrier, inertia, T * T_body_com)
-    return tree
+    return tree, {b: (joint_of[b], T_joint_body[b]) for b in joint_of}
+
+
+def _displacement(model: mujoco.MjModel, joint: int, position: float) -> pinocchio.SE3:
+    """How a hinge [rad] or slide [m] that is held moves its body from where the model is drawn."""
+    way, axis = position - model.qpos0[model.jnt_qposadr[joint]], model.jnt_axis[joint].copy()
+    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+        return pinocchio.SE3(np.eye(3), way * axis)
+    anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[joint].copy())
+    turn = pinocchio.SE3(pinocchio.AngleAxis(way, axis).toRotationMatrix(), np.zeros(3))
+    return anchor * turn * anchor.inverse()
 
 
 def _placement(position: Array, quaternion: Array) -> pinocchio.SE3:

@@ -1,0 +1,295 @@
+"""The compensator of live robots: its torque against MuJoCo, its commands in a simulation, and what it refuses."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import baselines
+from baselines import PositionCompensator
+from baselines.compensation.compensators import input_offset, newton_link_angle
+from baselines.compensation.gravity_torque import make_gravity
+from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint, Servo
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.joint.make_elastic import make_elastic
+from tests.trees import ORDER, TREE, tree
+
+# Three hinges and a gripper that slides; a spring in the shoulder, and gravity compensation on two bodies.
+ARM = """<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="base" pos="0 0 0.4" gravcomp="1">
+      <joint name="turn" axis="0.2 0 1" range="-3 3"/>
+      <inertial mass="3" pos="0.05 0 0.1" diaginertia="0.02 0.02 0.02"/>
+      <body name="upper" pos="0 0 0.2" euler="0.1 0.2 0">
+        <joint name="shoulder" axis="0 1 0" stiffness="12" springref="0.3" range="-2 2"/>
+        <inertial mass="2.5" pos="0.2 0.02 0" diaginertia="0.02 0.03 0.03"/>
+        <body name="lower" pos="0.4 0 0" gravcomp="0.4">
+          <joint name="elbow" axis="0 1 0.1" pos="0.01 0 0" ref="0.2"/>
+          <inertial mass="1.5" pos="0.15 0 0.01" diaginertia="0.01 0.01 0.01"/>
+          <body name="finger" pos="0.3 0 0">
+            <joint name="slide" type="slide" axis="1 0.2 0" ref="0.01"/>
+            <inertial mass="0.4" pos="0.02 0 0" diaginertia="0.001 0.001 0.001"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <keyframe><key qpos="0 0 0.2 0.05"/></keyframe>
+</mujoco>"""
+JOINTS = ["elbow", "turn", "shoulder"]  # not the order of the model
+STIFFNESS = {"*": 400.0, "shoulder": 900.0}
+
+INERTIAL = """<inertial><mass value="{}"/><origin xyz="{} 0 0"/>
+<inertia ixx="0.02" iyy="0.03" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial>"""
+URDF = f"""<robot name="arm">
+  <link name="world"/>
+  <link name="upper">
+    {INERTIAL.format(2, 0.2)}
+    <visual><geometry><mesh filename="package://nowhere/upper.stl"/></geometry></visual>
+    <collision><geometry><mesh filename="package://nowhere/upper.dae"/></geometry></collision>
+  </link>
+  <link name="lower">{INERTIAL.format(1, 0.1)}</link>
+  <link name="tool"/>
+  <joint name="shoulder" type="revolute">
+    <parent link="world"/><child link="upper"/><origin xyz="0 0 0.5"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="10" velocity="3"/>
+  </joint>
+  <joint name="elbow" type="continuous">
+    <parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/>
+  </joint>
+  <joint name="flange" type="fixed"><parent link="lower"/><child link="tool"/><origin xyz="0.3 0 0"/></joint>
+</robot>"""
+
+
+def model() -> mujoco.MjModel:
+    """The arm."""
+    return mujoco.MjModel.from_xml_string(ARM)
+
+
+def arm(**options: Any) -> PositionCompensator:
+    """Its compensator."""
+    return PositionCompensator.from_model(model(), STIFFNESS, **{"joints": JOINTS, **options})
+
+
+def needed(compiled: mujoco.MjModel, q: Array, q_dot: Array, q_ddot: Array) -> Array:
+    """Torque on `JOINTS` by MuJoCo's inverse dynamics, with its springs and its gravity compensation, (3,) [N·m]."""
+    data = mujoco.MjData(compiled)
+    data.qpos[:] = compiled.key_qpos[0]
+    at = JointAddresses.of(compiled, JOINTS)
+    data.qpos[at.q], data.qvel[at.q_dot], data.qacc[at.q_dot] = q, q_dot, q_ddot
+    compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    mujoco.mj_inverse(compiled, data)
+    return data.qfrc_inverse[at.q_dot].copy()
+
+
+@given(seed=st.integers(0, 10_000))
+def test_the_torque_is_that_of_mujoco(seed: int) -> None:
+    """Catches an ignored spring or gravcomp, a held joint at the wrong place, and joints in the order of the model."""
+    q, q_dot, q_ddot = np.random.default_rng(seed).uniform(-1.5, 1.5, (3, 3))
+    compensator = arm()
+    expected = needed(model(), q, q_dot, q_ddot)
+    np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(compensator.torque(q), needed(model(), q, np.zeros(3), np.zeros(3)), rtol=0, atol=1e-9)
+
+
+@given(seed=st.integers(0, 10_000), mass=st.floats(0.0, 5.0))
+def test_a_payload_is_a_mass_at_its_place(seed: int, mass: float) -> None:
+    """Catches a place in the frame of the wrong body, and a payload that is added to the last one."""
+    spec = mujoco.MjSpec.from_string(ARM)
+    place = [0.1, -0.05, 0.2]
+    spec.body("finger").add_body(
+        pos=place, ipos=[0.0] * 3, mass=1e-12 + mass, inertia=[1e-12] * 3, explicitinertial=True
+    )
+    q, q_dot, q_ddot = np.random.default_rng(seed).uniform(-1.5, 1.5, (3, 3))
+    compensator = arm()
+    compensator.set_payload(7.0, at=(1.0, 2.0, 3.0), body="upper")
+    compensator.set_payload(mass, at=place, body="finger")
+    expected = needed(spec.compile(), q, q_dot, q_ddot)
+    np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-8)
+
+
+def test_it_agrees_with_the_policies() -> None:
+    """Catches another formula than Eqs. 9 and 10 of the compensators, and another order."""
+    robot, q = tree(), np.array([0.3, -0.5, 0.9, 0.2, -1.1, 0.4])
+    gravity = make_gravity(robot)
+    compensator = PositionCompensator.from_model(mujoco.MjModel.from_xml_string(TREE), 1000.0, joints=ORDER)
+    np.testing.assert_allclose(
+        compensator.command(q) - q, input_offset(q, robot.stiffness, gravity), rtol=0, atol=1e-12
+    )
+    expected = newton_link_angle(q, robot.stiffness, gravity)
+    np.testing.assert_allclose(compensator.link_angle(q), expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(compensator.link_angle(compensator.command(q)), q, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("integral_gain", [0.0, 4000.0], ids=["gives way", "holds"])
+def test_links_of_a_simulated_arm_come_to_rest_where_they_should_be(integral_gain: float) -> None:
+    """Catches a servo's own sag with the wrong sign or gain, and a spring or gravcomp that is counted the wrong way."""
+    servo = Servo(
+        position_gain=800.0, velocity_gain=40.0, integral_gain=integral_gain, torque_limit=200.0, speed_limit=10.0
+    )
+    stiffness = {"elbow": 400.0, "turn": 400.0, "shoulder": 900.0}
+    elastic = make_elastic(
+        mujoco.MjSpec.from_string(ARM),
+        {
+            name: ElasticJoint(stiffness=value, damping=8.0, rotor_inertia=0.2, servo=servo)
+            for name, value in stiffness.items()
+        },
+    )
+    for joint in elastic.joints:
+        if joint.name == "slide":
+            joint.stiffness, joint.damping, joint.springref = np.array([1e5, 0, 0]), np.array([500.0, 0, 0]), 0.05
+    compiled = elastic.compile()
+    compensator = arm(position_gain=None if integral_gain else 800.0)
+    q, at = np.array([0.4, 0.3, -0.2]), JointAddresses.of(compiled, JOINTS)
+    errors = []
+    for command in (q, compensator.command(q)):
+        data = mujoco.MjData(compiled)
+        mujoco.mj_resetDataKeyframe(compiled, data, 0)
+        data.qpos[at.q] = data.qpos[at.theta] = q
+        for name, value in zip(JOINTS, command, strict=True):
+            data.actuator(f"{name}_servo").ctrl = value
+        mujoco.mj_step(compiled, data, 5000)
+        assert np.abs(data.qvel).max() < 1e-6
+        errors.append(np.abs(data.qpos[at.q] - q).max())
+        if integral_gain:  # servos that hold show the command
+            np.testing.assert_allclose(compensator.link_angle(data.qpos[at.theta]), data.qpos[at.q], atol=1e-5)
+    assert errors[0] > 2e-3
+    assert errors[1] < 0.01 * errors[0]
+
+
+def test_a_urdf_needs_no_meshes(tmp_path: Path) -> None:
+    """Catches a model that is refused for its pictures, and a tool that is merged into its link. Closed form."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    compensator = PositionCompensator.from_model(path, {"shoulder": 500.0, "elbow": math.inf})
+    assert compensator.joints == ("shoulder", "elbow")
+    q = np.array([0.3, 0.5])
+    compensator.set_payload(0.5, body="tool")
+    g = 9.81
+    elbow = -g * (1.0 * 0.1 + 0.5 * 0.3) * np.cos(q.sum())
+    shoulder = elbow - g * (2.0 * 0.2 + 1.5 * 0.4) * np.cos(q[0])
+    np.testing.assert_allclose(compensator.torque(q), [shoulder, elbow], rtol=1e-9)
+    np.testing.assert_allclose(compensator.command(q), q + np.array([shoulder / 500.0, 0.0]), rtol=1e-9)
+
+
+def test_offsets_grow_with_the_ramp_and_stay_within_their_limits() -> None:
+    """Catches a jump at the start or under a new payload, offsets beyond their bound, commands beyond the range."""
+    q = np.array([0.2, 0.1, 0.4])
+    full = arm().command(q) - q
+    gentle = arm(ramp_s=0.1, period_s=0.01)
+    shares = np.array([(gentle.command(q) - q)[2] / full[2] for _ in range(12)])
+    assert 0.0 < shares[0] < 0.02
+    assert (np.diff(shares[:10]) > 0.0).all()
+    np.testing.assert_allclose(shares[9:], 1.0, rtol=1e-12)
+    gentle.set_payload(2.0)
+    loaded = arm()
+    loaded.set_payload(2.0)
+    target, offsets = loaded.command(q)[2], [gentle.command(q)[2] for _ in range(10)]
+    steps = np.diff([q[2] + full[2], *offsets])
+    np.testing.assert_allclose(steps, (target - q[2] - full[2]) / 10, rtol=1e-6)
+    assert offsets[-1] == pytest.approx(target, abs=1e-12)
+    bounded = arm(limit_rad=1e-3)
+    assert np.abs(bounded.command(q) - q).max() == pytest.approx(1e-3)
+    assert bounded.clipped.any()
+    at_end = arm()
+    assert at_end.command(np.array([0.2, 0.0, 2.0]))[2] <= 2.0
+    assert not arm().clipped.any()
+
+
+@pytest.mark.parametrize(
+    ("q", "message"),
+    [
+        ([0.0, 0.0], r"q_desired must be 3 numbers \[rad\], of elbow, turn, shoulder; got \[0.0, 0.0\]"),
+        ([0.0, np.nan, 0.0], "q_desired must be finite.*see turn"),
+        ([0.0, 0.0, np.inf], "see shoulder"),
+        ("now", "q_desired must be 3 numbers"),
+        (None, "got None"),
+        (np.zeros((1, 3)), r"array of shape \(1, 3\)"),
+    ],
+)
+def test_what_is_no_angle_is_refused_and_changes_nothing(q: Any, message: str) -> None:
+    """Catches nan in a servo, and a ramp that goes on without a command."""
+    compensator, other = arm(ramp_s=0.1), arm(ramp_s=0.1)
+    with pytest.raises(ActionError, match=message):
+        compensator.command(q)
+    np.testing.assert_array_equal(compensator.command(np.zeros(3)), other.command(np.zeros(3)))
+
+
+CRANK = ARM.replace("<keyframe>", '<equality><joint joint1="elbow" joint2="turn"/></equality><keyframe>')
+GRIPPER = ARM.replace("<keyframe>", '<equality><joint joint1="slide"/></equality><keyframe>')
+FREE = """<mujoco><worldbody><body><freejoint name="root"/><geom size="0.1"/>
+  <body><joint name="a"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
+FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("xml", "stiffness", "options", "message"),
+    [
+        (ARM, {"shoulder": 900.0}, {}, "stiffness of joint 'turn' is missing; give 'turn' or a pattern"),
+        (
+            ARM,
+            {"*": 900.0, "sholder": 1.0},
+            {},
+            "unknown joint or pattern of joints 'sholder'.*Did you mean 'shoulder'",
+        ),
+        (ARM, 0.0, {}, r"stiffness of turn must be > 0 \[N·m/rad\], got 0"),
+        (ARM, -5, {}, "must be > 0"),
+        (ARM, math.nan, {}, "must be > 0"),
+        (ARM, "1000", {}, "must be a number"),
+        (ARM, True, {}, "must be a number"),
+        (ARM, [1.0, 2.0], {}, "stiffness must be 3 numbers.*of turn, shoulder, elbow, got 2"),
+        (ARM, 900.0, {"position_gain": {"*": None}}, "position_gain of turn must be a number"),
+        (ARM, 900.0, {"joints": ["wrist"]}, "unknown joint 'wrist'"),
+        (ARM, 900.0, {"joints": ["turn", "turn"]}, "each once"),
+        (ARM, 900.0, {"joints": ["slide"]}, "'slide' of the rigid model is no hinge"),
+        (ARM, 900.0, {"limit_rad": 0.0}, "limit_rad must be finite and > 0"),
+        (ARM, 900.0, {"ramp_s": -1.0}, "ramp_s must be finite and >= 0"),
+        (CRANK, 900.0, {}, "equality constraint of elbow and turn"),
+        (FREE, 900.0, {}, "'root' is free or a ball joint"),
+        (FIXED, 900.0, {}, "no hinge"),
+    ],
+)
+def test_models_and_values_that_cannot_be_used_are_refused(
+    xml: str, stiffness: Any, options: dict[str, Any], message: str
+) -> None:
+    """Catches a torque that is silently wrong, and a message that names no value."""
+    with pytest.raises(ConfigurationError, match=message):
+        PositionCompensator.from_model(mujoco.MjModel.from_xml_string(xml), stiffness, **options)
+
+
+def test_a_gripper_with_constraints_of_its_own_is_held() -> None:
+    """Catches a refusal for what no commanded joint feels."""
+    compensator = baselines.PositionCompensator.from_model(mujoco.MjModel.from_xml_string(GRIPPER), 900.0)
+    assert compensator.joints == ("turn", "shoulder", "elbow")
+
+
+def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
+    """Catches a traceback of MuJoCo or of an XML parser."""
+    for text, message in (
+        (None, "no model at"), ("{", "is no XML"), ("<mujoco><bdy/></mujoco>", "MuJoCo cannot read"),
+        ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "MuJoCo cannot compile.*mass"),
+    ):  # fmt: skip
+        path = tmp_path / "m.xml"
+        if text is not None:
+            path.write_text(text)
+        with pytest.raises(ConfigurationError, match=message):
+            PositionCompensator.from_model(path, 900.0)
+
+
+def test_a_load_that_overcomes_a_spring_is_said() -> None:
+    """Catches link angles that are no solution of Eq. 10."""
+    without_spring = mujoco.MjModel.from_xml_string(ARM.replace('stiffness="12"', ""))
+    weak = PositionCompensator.from_model(without_spring, {"*": 400.0, "shoulder": 1.5}, joints=JOINTS)
+    weak.set_payload(5.0)
+    with pytest.raises(ElasticError, match=re.escape("stiffness of shoulder (1.5 N·m/rad) too low")):
+        weak.link_angle(np.zeros(3))
