@@ -27,7 +27,7 @@ from elastic_env.motion.trajectory import minimum_jerk
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 """A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000, "wrist_*": 300}."""
 
-_TOLERANCE_RAD = 1e-12
+_TOLERANCE_RAD = 1e-11
 _MOST_ITERATIONS = 50
 
 
@@ -189,7 +189,7 @@ class PositionCompensator:
         q, residual = shown_angle, shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
-            if np.abs(residual).max() < _TOLERANCE_RAD:
+            if max(residual.max(), -residual.min()) < _TOLERANCE_RAD:
                 return q
             q = q - inverse @ residual
         weakest = self.joints[int(np.abs(residual).argmax())]

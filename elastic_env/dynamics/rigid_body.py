@@ -42,13 +42,14 @@ class RigidBody:
 
     def gravity_gradient(self, q: Array) -> Array:
         """∂τ_g/∂q, (..., n) [rad] to (..., n, n) [N·m/rad]."""
-        n = q.shape[-1]
-        rows = (q - self._zero).reshape(-1, n)
-        gradient = np.empty((len(rows), n, n))
-        for i, row in enumerate(rows):
-            full = pinocchio.computeGeneralizedGravityDerivatives(self._model, self._data, self._full(row))
-            gradient[i] = full[self._square]
-        return gradient.reshape(*q.shape, n)
+        n, moved = q.shape[-1], q - self._zero
+        if q.ndim == 1:
+            return self._gradient(moved)
+        return np.array([self._gradient(row) for row in moved.reshape(-1, n)]).reshape(*q.shape, n)
+
+    def _gradient(self, row: Array) -> Array:
+        full = pinocchio.computeGeneralizedGravityDerivatives(self._model, self._data, self._full(row))
+        return full[self._square]
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
         """Torque of a motion without friction, from (..., n) [rad], [rad/s], [rad/s²] to (..., n) [N·m]."""
@@ -69,6 +70,8 @@ class RigidBody:
         self._model.inertias[carrier] = self._bare[carrier] + load
 
     def _rows(self, function: Callable[..., Array], *arrays: Array) -> Array:
+        if arrays[0].ndim == 1:
+            return function(*(self._full(array) for array in arrays))[self._columns]
         n = arrays[0].shape[-1]
         rows = [array.reshape(-1, n) for array in arrays]
         result = np.empty(rows[0].shape)
