@@ -27,7 +27,8 @@ from elastic_env.motion.trajectory import minimum_jerk
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 """A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000, "wrist_*": 300}."""
 
-_TOLERANCE_RAD = 1e-11
+_LAST_STEP_RAD = 1e-8
+"""A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
 _MOST_ITERATIONS = 50
 
 
@@ -74,6 +75,7 @@ class PositionCompensator:
         self._floating = _floated(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
         self._spring = model.jnt_stiffness[at].copy()
+        self._has_springs = bool(self._spring.any())
         self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
@@ -189,9 +191,9 @@ class PositionCompensator:
         q, residual = shown_angle, shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
-            if max(residual.max(), -residual.min()) < _TOLERANCE_RAD:
-                return q
             q = q - inverse @ residual
+            if np.abs(residual).max() < _LAST_STEP_RAD:
+                return q
         weakest = self.joints[int(np.abs(residual).argmax())]
         raise ElasticError(
             f"no link angles for {shown_angle} rad: Eq. 10 did not converge in {_MOST_ITERATIONS} steps; is the "
@@ -233,7 +235,7 @@ class PositionCompensator:
             )
         if self._floating is not None:
             torque -= self._floating.gravity_torque(q)
-        return torque + self._spring * (q - self._spring_rest)
+        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
 
     def _gradient(self, q: Array) -> Array:
         gradient = self._body.gravity_gradient(q)
