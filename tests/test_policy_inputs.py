@@ -311,7 +311,8 @@ def test_folders_of_before_read_as_what_they_meant() -> None:
     for name in shipped():
         description = read_description(Path(name))
         raw = json.loads((ROOT / "baselines" / "trained" / name / "residual.json").read_text())["settings"]
-        assert list(description.settings.acts_on) == ["deflection" if raw["space"] == "model" else "command"]
+        old = {"model": ["deflection"], "joint": ["command"]}
+        assert list(description.settings.acts_on) == (old[raw["space"]] if "space" in raw else list(raw["acts_on"]))
     again = ResidualSettings(acts_on={"zmp": {"x": 0.01}, "hip": None})
     assert ResidualSettings(**again.model_dump()) == again
 
