@@ -135,8 +135,9 @@ def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     is_walker = isinstance(model, WalkerModel)
     known = ON_THE_WALKER if is_walker else ON_JOINTS
     # offsets that are learned turn both legs; a leg that keeps its own pitch lets the ZMP drift away over the walks
-    alike = options.replace(posture=options.posture.replace(swing_s=0.0))
-    base = known[learned_base(options, is_walker)].build(env, model, alike)
+    if "swing_s" not in options.posture.model_fields_set:
+        options = options.replace(posture=options.posture.replace(swing_s=0.0))
+    base = known[learned_base(options, is_walker)].build(env, model, options)
     signals = learned_signals(model, options.learning)
     return IterativeLearner(base, model, signals, options.learning.trials, options.ramp_s)
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,11 +82,11 @@ def arm(**options: Any) -> PositionCompensator:
     return PositionCompensator.from_model(model(), STIFFNESS, **{"joints": JOINTS, **options})
 
 
-def needed(compiled: mujoco.MjModel, q: Array, q_dot: Array, q_ddot: Array) -> Array:
-    """Torque on `JOINTS` by MuJoCo's inverse dynamics, with its springs and its gravity compensation, (3,) [N·m]."""
+def needed(compiled: mujoco.MjModel, q: Array, q_dot: Array, q_ddot: Array, joints: Sequence[str] = JOINTS) -> Array:
+    """Torque on joints by MuJoCo's inverse dynamics, with its springs and its gravity compensation, (n,) [N·m]."""
     data = mujoco.MjData(compiled)
     data.qpos[:] = compiled.key_qpos[0]
-    at = JointAddresses.of(compiled, JOINTS)
+    at = JointAddresses.of(compiled, joints)
     data.qpos[at.q], data.qvel[at.q_dot], data.qacc[at.q_dot] = q, q_dot, q_ddot
     compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     mujoco.mj_inverse(compiled, data)
@@ -100,6 +101,17 @@ def test_the_torque_is_that_of_mujoco(seed: int) -> None:
     expected = needed(model(), q, q_dot, q_ddot)
     np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(compensator.torque(q), needed(model(), q, np.zeros(3), np.zeros(3)), rtol=0, atol=1e-9)
+
+
+@given(seed=st.integers(0, 10_000), elbow=st.floats(-2.0, 2.0))
+def test_a_hinge_that_is_not_commanded_stays_where_the_keyframe_has_it(seed: int, elbow: float) -> None:
+    """Catches a turn about the origin of the body in the place of the hinge's anchor, and a forgotten reference."""
+    held = mujoco.MjModel.from_xml_string(ARM.replace('qpos="0 0 0.2 0.05"', f'qpos="0 0 {elbow} 0.05"'))
+    joints = ["shoulder", "turn"]
+    q, q_dot, q_ddot = np.random.default_rng(seed).uniform(-1.5, 1.5, (3, 2))
+    compensator = PositionCompensator.from_model(held, STIFFNESS, joints=joints)
+    expected = needed(held, q, q_dot, q_ddot, joints)
+    np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-9)
 
 
 @given(seed=st.integers(0, 10_000), mass=st.floats(0.0, 5.0))
@@ -227,6 +239,9 @@ def test_what_is_no_angle_is_refused_and_changes_nothing(q: Any, message: str) -
 
 CRANK = ARM.replace("<keyframe>", '<equality><joint joint1="elbow" joint2="turn"/></equality><keyframe>')
 GRIPPER = ARM.replace("<keyframe>", '<equality><joint joint1="slide"/></equality><keyframe>')
+TENDON = ARM.replace(
+    "<keyframe>", '<tendon><fixed stiffness="5"><joint joint="turn" coef="1"/></fixed></tendon><keyframe>'
+)
 FREE = """<mujoco><worldbody><body><freejoint name="root"/><geom size="0.1"/>
   <body><joint name="a"/><geom size="0.1"/></body></body></worldbody></mujoco>"""
 FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>"
@@ -255,6 +270,8 @@ FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>
         (ARM, 900.0, {"limit_rad": 0.0}, "limit_rad must be finite and > 0"),
         (ARM, 900.0, {"ramp_s": -1.0}, "ramp_s must be finite and >= 0"),
         (CRANK, 900.0, {}, "equality constraint of elbow and turn"),
+        (ARM.replace('"12"', '"12 3"'), 900.0, {}, "joint 'shoulder' has a spring whose torque is not linear"),
+        (TENDON, 900.0, {}, "tendons with stiffness"),
         (FREE, 900.0, {}, "'root' is free or a ball joint"),
         (FIXED, 900.0, {}, "no hinge"),
     ],

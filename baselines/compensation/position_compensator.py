@@ -5,10 +5,11 @@ The command leads the link by the deflection of its spring, and by what the serv
 .. math:: u = q + \left(K^{-1} + k_p^{-1}\right) \tau(q, \dot q, \ddot q)
 
 Eq. 9 is the case at rest of a servo that holds its angle. τ is the torque that the joints have to deliver: gravity,
-inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowers it. What a motor encoder shows is
-turned into the link angle by Eq. 10.
+inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowers it. Damping and friction of the model
+are not in it. What a motor encoder shows is turned into the link angle by Eq. 10.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -70,7 +71,7 @@ class PositionCompensator:
         self._model = model
         self.joints = tuple(_hinges(model) if joints is None else joints)
         held = _held(model, self.joints)
-        _require_open_tree(model, held)
+        _require_known_torque(model, held)
         self._body = RigidBody(model, self.joints, held)
         self._floating = _floated(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
@@ -112,6 +113,8 @@ class PositionCompensator:
 
     def set_payload(self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None) -> None:
         """Let the robot carry another point mass; commands take it over within the time of the ramp.
+
+        In another place or on another body it is taken over from zero: the command lets go of the last one at once.
 
         Args:
             mass_kg: Mass, 0 for none [kg].
@@ -183,22 +186,26 @@ class PositionCompensator:
         shown_angle = self._checked("theta", theta, "rad")
         gradient = self._compliance[:, None] * self._gradient(shown_angle)
         gradient.flat[:: len(shown_angle) + 1] += 1.0
+        # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at θ alone, for speed;
+        # the first step is Eq. 12
         try:
             inverse = np.linalg.inv(gradient)
         except np.linalg.LinAlgError:
-            inverse = np.eye(len(shown_angle))
-        # Newton's method with the gradient at θ: the first step is Eq. 12
+            raise self._overcome(shown_angle, np.abs(self._gradient(shown_angle)).max(axis=1)) from None
         q, residual = shown_angle, shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
             q = q - inverse @ residual
             if np.abs(residual).max() < _LAST_STEP_RAD:
                 return q
-        weakest = self.joints[int(np.abs(residual).argmax())]
-        raise ElasticError(
-            f"no link angles for {shown_angle} rad: Eq. 10 did not converge in {_MOST_ITERATIONS} steps; is the "
-            f"stiffness of {weakest} ({1.0 / self._compliance[self.joints.index(weakest)]:.6g} N·m/rad) too low for "
-            "its load?"
+        raise self._overcome(shown_angle, np.abs(residual))
+
+    def _overcome(self, theta: Array, how_much: Array) -> ElasticError:
+        """The error for a spring that its load overcomes, that of the joint where it is most."""
+        worst = int(how_much.argmax())
+        return ElasticError(
+            f"no link angles for {theta} rad: Eq. 10 did not converge in {_MOST_ITERATIONS} steps; is the stiffness of "
+            f"{self.joints[worst]} ({1.0 / self._compliance[worst]:.6g} N·m/rad) too low for its load?"
         )
 
     def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> tuple[Array, Array | None, Array | None]:
@@ -211,10 +218,7 @@ class PositionCompensator:
     def _checked(self, name: str, given: Any, unit: str) -> Array:
         """What a robot is asked for, as (n,)."""
         n = len(self.joints)
-        try:
-            values = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            values = np.empty(0)
+        values = _array(given)
         if values.shape != (n,):
             size = f", an array of shape {values.shape}" if isinstance(given, np.ndarray) else ""
             raise ActionError(
@@ -280,8 +284,13 @@ def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, float]:
     return held
 
 
-def _require_open_tree(model: mujoco.MjModel, held: Mapping[str, float]) -> None:
-    """Refuse what would add to the torque and is not in it: closed loops and springs of tendons."""
+def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> None:
+    """Refuse what adds to the torque and is not in it: closed loops, springs of tendons, non-linear springs."""
+    for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
+        if (name := model.joint(int(j)).name) not in held:
+            raise ConfigurationError(
+                f"joint {name!r} has a spring whose torque is not linear, which is not compensated; give it one number"
+            )
     for i in range(model.neq):
         of_joints = model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT
         names = (
@@ -293,7 +302,7 @@ def _require_open_tree(model: mujoco.MjModel, held: Mapping[str, float]) -> None
                 f"the model has an equality constraint {which}, whose torque is not known in advance; take it out, or "
                 "leave its joints out of `joints`"
             )
-    if model.ntendon and (model.tendon_stiffness > 0.0).any():
+    if model.tendon_stiffness.any() or model.tendon_stiffnesspoly.any():
         raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
 
 
@@ -301,7 +310,7 @@ def _floated(model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, fl
     """The weight that `gravcomp` of the bodies carries, as a robot of its own; None where there is none."""
     if not model.body_gravcomp.any():
         return None
-    carried = mujoco.MjModel.__copy__(model)
+    carried = copy.copy(model)
     carried.body_mass[:] = model.body_mass * model.body_gravcomp
     return RigidBody(carried, joints, held)
 
@@ -356,11 +365,16 @@ def _number(name: str, value: Any, unit: str, least: float | None = None, finite
     return number
 
 
-def _finite(name: str, given: Any, size: int, unit: str) -> Array:
+def _array(given: Any) -> Array:
+    """What was given as an array; empty where it is none of numbers."""
     try:
-        values = np.asarray(given, dtype=np.float64)
+        return np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
-        values = np.empty(0)
+        return np.empty(0)
+
+
+def _finite(name: str, given: Any, size: int, unit: str) -> Array:
+    values = _array(given)
     if values.shape != (size,) or not np.isfinite(values).all():
         raise ConfigurationError(f"{name} must be {size} finite numbers [{unit}], got {shown(given)}")
     return values

@@ -35,14 +35,11 @@ def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujo
     except (ET.ParseError, UnicodeDecodeError, OSError) as error:
         raise ConfigurationError(f"{path} is no XML: {error}; give a file of MJCF (.xml) or URDF (.urdf)") from None
     try:
-        spec = mujoco.MjSpec.from_string(_without_shapes(root)) if root.tag == "robot" else _from_file(path)
+        is_urdf = root.tag == "robot"
+        spec = mujoco.MjSpec.from_string(_without_shapes(root)) if is_urdf else mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ConfigurationError(f"MuJoCo cannot read {path}: {error}") from None
     return _compiled(spec, str(path))
-
-
-def _from_file(path: Path) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(str(path))
 
 
 def _without_shapes(robot: ET.Element) -> str:
