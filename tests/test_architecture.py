@@ -76,7 +76,8 @@ ROOMS = [
     "baselines.compensation", "baselines.walking", "baselines.estimation", "baselines.adaptation",
     "baselines.options", "baselines.catalogue", "baselines.identification", "baselines.residual", "baselines.policies",
     "baselines.residual_env", "baselines",
-    "train.runs", "train.evaluate", "train.figures", "train.report", "train.learn", "train.experiments", "train.speed",
+    "train.runs", "train.workers", "train.evaluate", "train.cells",
+    "train.figures", "train.report", "train.learn", "train.experiments", "train.speed",
     "train.hardware", "train.commands", "train",
 ]  # fmt: skip
 """Folders, and modules beside them, in the order in which they may import: each from those before it."""

@@ -557,7 +557,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     }  # fmt: skip
     (root / "two.yaml").write_text(yaml.safe_dump(content))
 
-    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+    def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:

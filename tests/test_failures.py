@@ -21,7 +21,8 @@ from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import PolicyFailedError, blamed
 from train.runs.failures import explained
-from train.runs.workers import WorkerKilledError, duration, plain_progress
+from train.runs.progress import duration, plain_progress
+from train.workers.calls import WorkerKilledError
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 POLICIES = """
@@ -103,7 +104,7 @@ def several(*commands: tuple[int | None, list[str]], first: str = "", **options:
         (ConfigurationError("no"), "no", 2),
         (SystemFailedError("gone"), "gone", 3),
         (OSError(errno.ENOSPC, "No space left on device", "runs/x"), "runs/x: No space left on device; free some", 3),
-        (WorkerKilledError([]), "a worker process was killed", 3),
+        (WorkerKilledError(), "a worker process was killed", 3),
         (MemoryError(), "there is not enough memory", 3),
         (ModuleNotFoundError("", name="torch"), "constraints.txt '.[train]'", 2),
         (ModuleNotFoundError("", name="plotly.offline"), "constraints.txt '.[report]'", 2),

@@ -319,7 +319,7 @@ def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyP
     }  # fmt: skip
     Path("board.yaml").write_text(yaml.safe_dump(content))
 
-    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+    def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
     monkeypatch.setattr(train.experiments.compare, "run_conditions", run)

@@ -37,7 +37,7 @@ from train.evaluate.evaluate import Evaluation, evaluate
 from train.experiments.compare import CompareConfig
 from train.experiments.play import play
 from train.runs.folders import new_run, run_folder
-from train.runs.workers import show_progress
+from train.runs.progress import show_progress
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
@@ -76,7 +76,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Conditions are evaluated in this process: starting others takes seconds."""
 
-    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+    def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
     monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
@@ -730,7 +730,7 @@ import sys, time
 
 class Finder:
     def find_spec(self, name, path=None, target=None):
-        if name == "train.runs.workers" and "--multiprocessing-fork" in sys.orig_argv:
+        if name == "train.workers.local" and "--multiprocessing-fork" in sys.orig_argv:
             time.sleep({})
 
 sys.meta_path.insert(0, Finder())
@@ -741,7 +741,8 @@ sys.meta_path.insert(0, Finder())
 def test_a_comparison_that_ends_takes_its_workers_with_it(
     tmp_path: Path, how: signal.Signals, import_s: float, wait_s: float
 ) -> None:
-    """Catches Ctrl-C that is ignored until all is done, that workers answer with tracebacks, and workers that go on.
+    """Catches a second Ctrl-C that is ignored until all is done, that workers answer with tracebacks, and workers that
+    go on.
 
     The workers import for `import_s` longer than they need. SIGINT reaches the whole process group, as from a terminal,
     the parent last; SIGKILL the parent alone.
@@ -759,9 +760,10 @@ def test_a_comparison_that_ends_takes_its_workers_with_it(
         time.sleep(0.05)
     time.sleep(wait_s)
     if how is signal.SIGINT:
-        for member in sorted(_members(process.pid), key=lambda member: member == process.pid):
-            os.kill(member, how)
-            time.sleep(0.1)
+        for _ in range(2):  # the first one lets what is running end
+            for member in sorted(_members(process.pid), key=lambda member: member == process.pid):
+                os.kill(member, how)
+                time.sleep(0.1)
         output, _ = process.communicate(timeout=20)
         assert process.returncode == 130, output
         assert "Traceback" not in output

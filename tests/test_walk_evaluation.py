@@ -68,7 +68,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Conditions are evaluated in this process: starting others takes seconds."""
 
-    def run(conditions: Sequence[Condition], console: Console, jobs: int = 0) -> list[Evaluation]:
+    def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
     monkeypatch.setattr(train.experiments.compare, "run_conditions", run)

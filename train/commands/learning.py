@@ -34,6 +34,8 @@ class Train:
     """With --resume: run the code that the run's algorithm names, where it is none of Stable-Baselines3's."""
     jobs: int = 1
     """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
+    on: str = "local"
+    """Where seeds run: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
 
     def run(self) -> None:
         """Train, or go on with it."""
@@ -47,16 +49,16 @@ class Train:
             )
         from train.learn.run_training import resume, start
         from train.learn.train_config import TrainConfig
-        from train.runs.workers import require_jobs
+        from train.workers.places import Place
 
-        require_jobs(self.jobs)
+        place = Place(self.on, self.jobs)
         if self.resume is not None:
-            folder = resume(self.resume, CONSOLE, self.jobs, self.trust_code)
+            folder = resume(self.resume, CONSOLE, place, self.trust_code)
         else:
             config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
             with options_named():
                 config = config.replace(**changes)
-            folder = start(config, CONSOLE, self.output, self.jobs)
+            folder = start(config, CONSOLE, self.output, place)
         CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
 
 

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import tyro
 
 from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError
 from train.commands.options import (
     CONSOLE,
     DEFAULT_SCENARIO,
@@ -133,24 +134,46 @@ class Compare:
     Example, heat maps over two axes: elastic compare configs/map_payload_slope.yaml
     """
 
-    config: Annotated[Path, tyro.conf.Positional]
-    """YAML configuration, see configs/."""
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """YAML configuration, see configs/; with --resume the one of the run unless another is named."""
     output: Path | None = None
     """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
     jobs: int = 0
     """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
-    on: OnHardware = field(default_factory=OnHardware)
+    on: str = "local"
+    """Where they run: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    resume: Path | None = None
+    """Folder of a run to go on with: what is missing or has changed is played."""
+    fresh: bool = False
+    """With --resume: play all cells again."""
+    trust_code: bool = False
+    """With --resume and no configuration: run the code that the run's own names."""
+    hardware: OnHardware = field(default_factory=OnHardware)
 
     def run(self) -> None:
         """Compare."""
-        from train.experiments.compare import CompareConfig, compare
+        from train.experiments.compare import CompareConfig, Work, compare, recorded
+        from train.workers.places import Place
 
-        config, arguments = load_yaml(self.config, CompareConfig), self.on.arguments
-        if arguments:
+        self._require()
+        if self.config is not None:
+            config = load_yaml(self.config, CompareConfig)
+        else:
+            config = recorded(cast(Path, self.resume), self.trust_code)
+        if arguments := self.hardware.arguments:
             real = place(config.env, arguments)
             real["env_options"] = {**config.env_options, **real["env_options"]}
             config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
-        _print_files(compare(config, CONSOLE, self.output, self.jobs))
+        work = Work(Place(self.on, self.jobs), self.resume is not None, self.fresh)
+        _print_files(compare(config, CONSOLE, self.resume or self.output, work))
+
+    def _require(self) -> None:
+        if self.config is None and self.resume is None:
+            raise ConfigurationError("name a configuration or, with --resume, the run to go on with")
+        if self.resume is not None and self.output is not None:
+            raise ConfigurationError("a run goes on in its own folder: --resume takes no --output")
+        if self.resume is None and self.fresh:
+            raise ConfigurationError("--fresh needs --resume; a new run plays all of its cells")
 
 
 @dataclass

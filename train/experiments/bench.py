@@ -15,7 +15,7 @@ from rich.table import Table
 
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.cells import run_conditions
+from train.cells.play import run_conditions
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import Evaluation

@@ -1,6 +1,7 @@
 """Policies × scenarios × references × seeds under one protocol: one tidy CSV, a summary table, figures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -8,9 +9,11 @@ from typing import Any, Self
 from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
-from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, quantity
-from elastic_env.core.errors import ConfigurationError, require_known, shown
-from train.evaluate.cells import CellsFailedError, run_conditions
+from baselines.policies import is_saved
+from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, load_yaml, quantity
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shown
+from train.cells.play import CellsFailedError, run_conditions
+from train.cells.store import CELLS, Store
 from train.evaluate.changes import changes, merged
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import Environment, Reference, environment
@@ -27,9 +30,9 @@ from train.report.changes_tables import print_changes, write_maps, write_statist
 from train.report.leaderboard import write_leaderboard
 from train.report.robots_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
-from train.runs.folders import run_folder
+from train.runs.folders import CONFIG, describe, locked, run_folder
 from train.runs.kinds import is_a
-from train.runs.workers import require_jobs
+from train.workers.places import HERE, Place
 
 _MOST_CELLS = 10_000
 
@@ -217,8 +220,23 @@ class Comparison:
     files: list[Path]
 
 
+@dataclass(frozen=True)
+class Work:
+    """How a comparison is played.
+
+    Attributes:
+        place: Where its cells are played.
+        resumes: Whether the output folder is a run that is gone on with.
+        fresh: Whether cells that it keeps are played again.
+    """
+
+    place: Place = HERE
+    resumes: bool = False
+    fresh: bool = False
+
+
 def compare(
-    config: CompareConfig, console: Console, output: Path | None = None, jobs: int = 0, report: bool = True
+    config: CompareConfig, console: Console, output: Path | None = None, work: Work | None = None, report: bool = True
 ) -> Comparison:
     """Run a comparison, write its folder, and print its tables.
 
@@ -226,30 +244,24 @@ def compare(
         config: What to compare.
         console: Where progress and table go.
         output: Folder for the results; default runs/<name>, numbered if taken.
-        jobs: Conditions to run at the same time, 0 for one per core.
+        work: How it is played; None for this machine and a new run.
         report: Whether policies are compared with one another, and bases of residuals added for it; else they are
-            scored alone.
+            scored alone, and no cells are kept.
 
     Raises:
         ConfigurationError: A name or a parameter does not exist; found before the work begins.
         ResultsExistError: The output folder holds results.
+        KeyboardInterrupt: Ctrl-C; finished cells are kept.
     """
-    require_jobs(jobs)
+    work = work or Work()
     plots.require_matplotlib()
     if report:
         require_plotly()
         require_jinja2()
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
-    with run_folder(config.name, config.model_dump(mode="json"), config.seed, output) as folder:
-        try:
-            evaluations = run_conditions(conditions, console, jobs)
-        except CellsFailedError as error:
-            if error.finished:
-                write_summary(merged(error.finished), folder / "summary.md")
-                kept = write_episodes(error.finished, folder / "episodes.csv")
-                console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
-            raise
+    with _folder(config, output, work) as folder:
+        evaluations = _played(conditions, console, work, folder, keeps=report)
         files = [write_episodes(evaluations, folder / "episodes.csv")]
         robots = robot_scores(evaluations)
         if robots:
@@ -274,6 +286,64 @@ def compare(
     print_robots(robots, console)
     print_changes(rows, console)
     return Comparison(folder, evaluations, files)
+
+
+def recorded(folder: Path, trust_code: bool = False) -> CompareConfig:
+    """The configuration of a run that is gone on with.
+
+    Args:
+        folder: Of the run.
+        trust_code: Whether code of one's own that it names may run: it may lie in the folder.
+
+    Raises:
+        ConfigurationError: The folder is no comparison, or names code that is not trusted.
+    """
+    file = folder / CONFIG
+    if not file.is_file():
+        raise ConfigurationError(f"{folder} is no run: it has no {CONFIG}; name the folder that compare wrote")
+    config = load_yaml(file, CompareConfig)
+    for name in (config.env, *(policy.name for policy in config.policies)):
+        if ":" in name and not is_saved(name) and not trust_code:
+            raise ConfigurationError(
+                f"{file} names code of its own, {name!r}, which would run; look at it, then name your configuration "
+                "before --resume, or say --trust-code"
+            )
+    return config
+
+
+@contextmanager
+def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[Path]:
+    """The folder of a run, new or gone on with, for this program alone."""
+    content = config.model_dump(mode="json")
+    if not work.resumes or output is None:
+        with run_folder(config.name, content, config.seed, output) as folder, locked(folder):
+            yield folder
+        return
+    if not (output / CONFIG).is_file():
+        raise ConfigurationError(f"{output} is no run: it has no {CONFIG}; name the folder that compare wrote")
+    with locked(output):
+        describe(output, content, config.seed)
+        yield output
+
+
+def _played(
+    conditions: Sequence[Condition], console: Console, work: Work, folder: Path, keeps: bool
+) -> list[Evaluation]:
+    """The cells; what is finished when some fail, or at Ctrl-C, is kept."""
+    store = Store(folder / CELLS) if keeps else None
+    go_on = f"go on with: elastic compare --resume {folder}"
+    try:
+        return run_conditions(conditions, console, work.place, store, work.fresh)
+    except CellsFailedError as error:
+        if error.finished:
+            write_summary(merged(error.finished), folder / "summary.md")
+            kept = write_episodes(error.finished, folder / "episodes.csv")
+            console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
+        raise
+    except (KeyboardInterrupt, SystemFailedError, OSError) as error:
+        if (folder / CELLS).is_dir():
+            error.add_note(f"finished cells are kept; {go_on}")
+        raise
 
 
 def _require_each_once(what: str, values: Sequence[object]) -> None:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import make_gravity
-from train.evaluate.cells import run_conditions
+from train.cells.play import run_conditions
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.evaluate import Evaluation, make_vector_env
 from train.experiments.compare import CompareConfig

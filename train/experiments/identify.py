@@ -19,7 +19,7 @@ from train.figures import plots
 from train.figures.testbed_plots import draw_identification
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
-from train.runs.workers import plain_progress, show_progress
+from train.runs.progress import plain_progress, show_progress
 
 
 class IdentifyConfig(Model):

@@ -26,7 +26,7 @@ from train.figures import plots
 from train.figures.learning_plots import draw_trials
 from train.runs.escaping import write_records
 from train.runs.folders import provenance, run_folder
-from train.runs.workers import show_progress
+from train.runs.progress import show_progress
 
 _MOST_ROBOTS = 64
 

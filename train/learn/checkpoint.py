@@ -6,13 +6,13 @@ a full disk or a failing one; it is no seal against somebody who writes both.
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from elastic_env.core.errors import ElasticError
+from train.runs.whole import flush
 
 _DIGESTS = "sha256.json"
 
@@ -30,13 +30,13 @@ def written(checkpoint: Path) -> Iterator[Path]:
     digests = {file.name: _digest(file) for file in sorted(fresh.iterdir())}
     (fresh / _DIGESTS).write_text(json.dumps(digests, indent=2) + "\n", encoding="utf-8")
     for file in fresh.iterdir():
-        _flush(file)
-    _flush(fresh)
+        flush(file)
+    flush(fresh)
     shutil.rmtree(old, ignore_errors=True)
     if checkpoint.exists():
         checkpoint.rename(old)
     fresh.rename(checkpoint)
-    _flush(checkpoint.parent)
+    flush(checkpoint.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -84,12 +84,3 @@ def _beside(checkpoint: Path, ending: str) -> Path:
 def _digest(file: Path) -> str:
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
-
-
-def _flush(path: Path) -> None:
-    """Have a file or folder on the disk before anything that comes later."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

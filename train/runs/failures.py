@@ -18,12 +18,13 @@ WRONG_INPUT, SYSTEM_FAILED, DEFECT = 2, 3, 70
 _EXTRAS = {
     "train": ("torch", "stable_baselines3", "tensorboard", "cmaes"),
     "report": ("matplotlib", "plotly", "jinja2", "imageio", "imageio_ffmpeg", "PIL"),
+    "cluster": ("dask", "distributed", "submitit"),
     "hardware": ("dynamixel_sdk", "serial", "mscl"),
 }
 _CURES = {
-    errno.ENOSPC: "free some space; a training goes on with --resume",
-    errno.EDQUOT: "free some of your quota; a training goes on with --resume",
-    errno.EFBIG: "raise the limit on the size of files (ulimit -f); a training goes on with --resume",
+    errno.ENOSPC: "free some space; a run goes on with --resume",
+    errno.EDQUOT: "free some of your quota; a run goes on with --resume",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f); a run goes on with --resume",
     errno.EROFS: "name a folder that can be written, by --output",
     errno.EACCES: "name a folder that can be written, by --output",
 }

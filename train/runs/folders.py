@@ -17,10 +17,13 @@ from typing import Any
 import yaml
 
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, SystemFailedError
+from train.runs.whole import write_whole
 
 RUNS = Path("runs")
 """Where results go unless a folder is named."""
 
+CONFIG = "config.yaml"
+"""File of a run with its resolved configuration."""
 _LOCK = ".lock"
 _PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
 
@@ -41,10 +44,7 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
         ResultsExistError: The named output folder is not empty.
     """
     folder = free_folder(name, output)
-    texts = {
-        "config.yaml": yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
-        "metadata.json": json.dumps(provenance(seed), indent=2) + "\n",
-    }
+    texts = _description(configuration, seed)
     try:
         for file, text in texts.items():
             (folder / file).write_text(text)
@@ -52,6 +52,20 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
         _remove(folder, texts)
         raise
     return folder
+
+
+def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
+    """Write down anew what the results of a run depend on, when it is gone on with; arguments as `new_run`."""
+    for file, text in _description(configuration, seed).items():
+        write_whole(folder / file, text.encode())
+
+
+def _description(configuration: dict[str, Any], seed: int | None) -> dict[str, str]:
+    """Texts of the files that describe a run."""
+    return {
+        CONFIG: yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
+        "metadata.json": json.dumps(provenance(seed), indent=2) + "\n",
+    }
 
 
 def free_folder(name: str, output: Path | None = None) -> Path:

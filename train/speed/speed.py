@@ -18,7 +18,7 @@ from rich.table import Table
 from elastic_env.core.config import Model, quantity
 from train.evaluate.environments import environment
 from train.runs.folders import run_folder
-from train.runs.workers import plain_progress
+from train.runs.progress import plain_progress
 from train.speed.contenders import (
     Contender,
     GymnasiumLoop,

@@ -1,0 +1,113 @@
+"""How far long work is: bars on a terminal, a line now and then in a log."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+_LEAST_S = 10.0
+"""Time between two lines of progress in a log [s]; shorter work says nothing."""
+_ANNOUNCED_S, _LONG_S = 3.0, 30.0
+"""When the time to go is said, and from how much on [s]."""
+
+
+class Show(Protocol):
+    """Shows how far a task is."""
+
+    def __call__(self, number: int, amount: int, note: str = "", /) -> None:
+        """Show it.
+
+        Args:
+            number: Of the task.
+            amount: How much of it has been done.
+            note: What else is to be said, such as how many calls are running.
+        """
+
+
+class Say(Protocol):
+    """Says how much of the work has been done."""
+
+    def __call__(self, share: float, note: str = "", /) -> None:
+        """Say it: the share, from 0 to 1, and a note behind it."""
+
+
+def plain_progress(console: Console, least_s: float = 0.0) -> Say:
+    """A function that takes the share of the work that is done, and says each tenth of it in a line.
+
+    Long work is announced early, with the time that it will take. A line with a note ends with the time to go.
+
+    For work beside a control loop and work that is timed, from which the thread of a bar would take time, and for logs.
+
+    Args:
+        console: Where it says so.
+        least_s: Shortest time between two lines, and before the first one [s].
+    """
+    said, when = 0, time.monotonic()
+    first: tuple[float, float] | None = None  # processes take their time to start
+    is_announced = False
+
+    def say(share: float, note: str = "") -> None:
+        nonlocal said, when, first, is_announced
+        if share <= 0.0:
+            return
+        first = first or (time.monotonic(), share)
+        elapsed, done = time.monotonic() - first[0], share - first[1]
+        to_go = elapsed * (1.0 - share) / done if done > 0.0 else 0.0
+        if not is_announced and done > 0.0 and elapsed > _ANNOUNCED_S:
+            is_announced = True
+            if to_go > _LONG_S:
+                console.print(f"  about {duration(to_go)} to go")
+        if int(10 * share) > said and time.monotonic() - when >= least_s:
+            said, when = int(10 * share), time.monotonic()
+            more = f": {note}, about {duration(to_go)} to go" if note else ""
+            console.print(f"  {10 * said} %{more}", soft_wrap=True)
+
+    return say
+
+
+def duration(seconds: float) -> str:
+    """A time in words, rounded to what matters: 40 s, 3 min, 2 h."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{10.0 * round(seconds / 10.0):.0f} s"
+
+
+@contextmanager
+def show_progress(console: Console, totals: Mapping[str, int], transient: bool = False) -> Iterator[Show]:
+    """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there is none.
+
+    Args:
+        console: Where it is shown.
+        totals: What is to be done of every task, by its name.
+        transient: Whether the bars vanish at the end.
+
+    Yields:
+        A function that takes the number of a task, how much of it has been done, and a note.
+    """
+    if not console.is_terminal:
+        yield _lines(console, totals)
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    noted = TimeRemainingColumn(), TextColumn("{task.fields[note]}")
+    with Progress(*columns, *noted, console=console, transient=transient) as bar:
+        tasks = [bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()]
+
+        def draw(number: int, amount: int, note: str = "") -> None:
+            bar.start_task(tasks[number])
+            bar.update(tasks[number], completed=amount, note=note)
+
+        yield draw
+
+
+def _lines(console: Console, totals: Mapping[str, int]) -> Callable[..., None]:
+    say, done = plain_progress(console, _LEAST_S), [0] * len(totals)
+
+    def count(number: int, amount: int, note: str = "") -> None:
+        done[number] = amount
+        say(sum(done) / sum(totals.values()), note)
+
+    return count

@@ -1,0 +1,299 @@
+"""Calls of one function beside each other, by any `concurrent.futures.Executor`: faults, reports and Ctrl-C.
+
+A call that raises is an outcome, and the others go on. A call whose worker is lost begins anew elsewhere.
+"""
+
+import os
+import pickle
+import platform
+import queue
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from elastic_env.core.errors import ElasticError, SystemFailedError
+from train.workers.versions import VersionsDifferError, everything, require_same
+
+MOST_MOVES = 2
+"""How often a call begins anew after its worker was lost."""
+_WAIT_S = 0.2
+
+Reporter = Callable[[int, Any], None]
+"""Takes the number of a call and what it reports; it travels to the workers."""
+
+
+class WorkerLostError(SystemFailedError):
+    """The worker of a call is gone: killed, preempted, or out of reach. An executor's future raises it."""
+
+
+class WorkerKilledError(SystemFailedError):
+    """A call lost its worker each time that it was begun."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a worker process was killed each time that it was tried, most often for lack of memory; take fewer --jobs "
+            "or more memory"
+        )
+
+
+class PlaceLostError(SystemFailedError):
+    """What runs the calls is gone: the scheduler of a cluster."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a call.
+
+    Attributes:
+        value: What it returned.
+        error: What it raised; None where it returned.
+        trace: Traceback of the error.
+    """
+
+    value: Any = None
+    error: Exception | None = None
+    trace: str = ""
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Workers.
+
+    Attributes:
+        executor: What runs calls. Its futures raise `WorkerLostError` where a call may begin anew.
+        reporter: How a call reports.
+        events: Where the reports arrive, as pairs of number and report.
+    """
+
+    executor: Executor
+    reporter: Reporter
+    events: "queue.SimpleQueue[Any]" = field(default_factory=queue.SimpleQueue)
+
+
+@dataclass(frozen=True)
+class Home:
+    """What a worker takes over from the program that calls it.
+
+    Attributes:
+        folder: Working folder, from which configurations name files.
+        versions: See `everything`.
+    """
+
+    folder: Path
+    versions: Mapping[str, str]
+
+    @staticmethod
+    def here() -> "Home":
+        """That of this program."""
+        return Home(Path.cwd(), everything())
+
+    def enter(self) -> None:
+        """In a worker: work where the program does, if this machine has that folder.
+
+        Raises:
+            VersionsDifferError: This machine has other versions.
+        """
+        require_same(self.versions, everything(), platform.node())
+        if self.folder.is_dir():
+            os.chdir(self.folder)
+            if str(self.folder) not in sys.path:
+                sys.path.append(str(self.folder))
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who is told how calls go.
+
+    Attributes:
+        reported: Takes the number of a call and what it reports.
+        ended: Takes the number of a call and its outcome, as soon as it has one.
+        tallied: Takes how many are done, running, failed, and there at all.
+        moved: Takes the number of a call that begins anew.
+    """
+
+    reported: Callable[[int, Any], None] = lambda *_: None
+    ended: Callable[[int, Outcome], None] = lambda *_: None
+    tallied: Callable[["Tally"], None] = lambda _: None
+    moved: Callable[[int], None] = lambda _: None
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How many calls are where."""
+
+    done: int
+    running: int
+    failed: int
+    total: int
+
+    def in_words(self, what: str) -> str:
+        """Such as: 3 of 8 cells done, 2 running, 0 failed."""
+        return f"{self.done} of {self.total} {what} done, {self.running} running, {self.failed} failed"
+
+
+def run_calls(
+    function: Callable[..., Any],
+    arguments: Sequence[tuple[Any, ...]],
+    pool: Pool,
+    watch: Watch,
+    finishes: bool = True,
+) -> list[Outcome | None]:
+    """Call a function with each of some arguments.
+
+    Args:
+        function: At the top of a module; it gets the arguments and, behind them, a function that takes its reports.
+        arguments: Of each call.
+        pool: Where they run.
+        watch: Who is told how they go.
+        finishes: Whether the first Ctrl-C lets running calls end and starts no others; else it ends at once.
+
+    Returns:
+        Outcomes in the order of the arguments; None for calls that Ctrl-C kept from starting.
+
+    Raises:
+        VersionsDifferError: A machine has other versions.
+        PlaceLostError: The executor is gone.
+        KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
+    """
+    run = _Run(function, arguments, pool, watch)
+    if not finishes:
+        run.go(threading.Event())
+        return run.outcomes
+    with _first_ctrl_c() as asked:
+        run.go(asked)
+    return run.outcomes
+
+
+class _Run:
+    """Calls that are under way."""
+
+    def __init__(
+        self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], pool: Pool, watch: Watch
+    ) -> None:
+        self._function, self._arguments, self._pool, self._watch = function, arguments, pool, watch
+        self._home, self._futures = Home.here(), dict[Future[Any], int]()
+        self._tries, self._running, self._is_ending = [0] * len(arguments), set[int](), False
+        self.outcomes: list[Outcome | None] = [None] * len(arguments)
+        self._done = self._failed = 0
+
+    def go(self, asked: threading.Event) -> None:
+        """To the end of all calls, or once `asked` to, of those that run."""
+        for number in range(len(self._arguments)):
+            self._submit(number)
+        while self._futures:
+            if asked.is_set() and not self._is_ending:
+                self._is_ending = True
+                self._cancel_waiting()
+            with suppress(queue.Empty):
+                self._take(self._pool.events.get(timeout=_WAIT_S))
+
+    def _submit(self, number: int) -> None:
+        self._tries[number] += 1
+        given = self._function, self._arguments[number], number, self._home, self._pool.reporter
+        try:
+            future = self._pool.executor.submit(carried_out, *given)
+        except RuntimeError as error:  # it was shut down
+            raise PlaceLostError(f"the workers are gone: {error}") from None
+        self._futures[future] = number
+        future.add_done_callback(self._pool.events.put)
+
+    def _cancel_waiting(self) -> None:
+        for future, number in list(self._futures.items()):
+            if number not in self._running and future.cancel():
+                self._futures.pop(future, None)
+
+    def _take(self, event: Any) -> None:
+        """A future that is done, or a report."""
+        if isinstance(event, Future):
+            if event in self._futures:
+                self._end(self._futures.pop(event), event)
+        else:
+            number, report = event
+            if self.outcomes[number] is None:  # a report may come behind the end
+                self._running.add(number)
+            self._watch.reported(number, report)
+        self._watch.tallied(Tally(self._done, len(self._running), self._failed, len(self._arguments)))
+
+    def _end(self, number: int, future: Future[Any]) -> None:
+        self._running.discard(number)
+        outcome = _outcome(future)
+        if isinstance(outcome.error, VersionsDifferError | PlaceLostError):
+            raise outcome.error
+        if isinstance(outcome.error, WorkerLostError):
+            if self._is_ending:
+                return
+            if self._tries[number] <= MOST_MOVES:
+                self._watch.moved(number)
+                self._submit(number)
+                return
+            outcome = Outcome(error=WorkerKilledError())
+        self.outcomes[number] = outcome
+        self._done += outcome.error is None
+        self._failed += outcome.error is not None
+        self._watch.ended(number, outcome)
+
+
+def carried_out(
+    function: Callable[..., Any], given: tuple[Any, ...], number: int, home: Home, reporter: Reporter
+) -> Outcome:
+    """In a worker: the outcome of a call, which never raises."""
+
+    def report(value: Any) -> None:
+        reporter(number, value)
+
+    try:
+        home.enter()
+        report(0)
+        return Outcome(function(*given, report))
+    except Exception as error:
+        return Outcome(error=_portable(error), trace=traceback.format_exc())
+
+
+class CallFailedError(ElasticError):
+    """A call raised an error that does not travel between processes; this one has its text."""
+
+
+def _portable(error: Exception) -> Exception:
+    """An error without its traceback, as it can be sent."""
+    error.__traceback__ = None
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return CallFailedError(f"{type(error).__name__}: {error}")
+    return error
+
+
+def _outcome(future: Future[Any]) -> Outcome:
+    if future.cancelled():
+        return Outcome(error=PlaceLostError("the workers are gone: they dropped what was to be done"))
+    error = future.exception()
+    if error is None:
+        return future.result()
+    return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
+
+
+@contextmanager
+def _first_ctrl_c() -> Iterator[threading.Event]:
+    """Ctrl-C sets an event; the second one does what it did before."""
+    asked, before = threading.Event(), signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield asked
+        return
+
+    def note(number: int, frame: Any) -> None:
+        if asked.is_set():
+            before(number, frame)
+        asked.set()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,131 @@
+"""Workers of a dask cluster, whose scheduler and workers somebody else has started."""
+
+import logging
+import queue
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, missing_extra
+from train.workers.calls import MOST_MOVES, PlaceLostError, Pool, WorkerKilledError
+from train.workers.versions import everything, require_same
+
+_CONNECT_S = 10
+_WORKER_S = 60
+
+
+@contextmanager
+def dask_pool(address: str) -> Iterator[Pool]:
+    """Workers of the cluster whose scheduler has an address.
+
+    Dask itself moves the calls of a worker that is lost: as often as `MOST_MOVES` says, or less where its scheduler is
+    told so.
+
+    Args:
+        address: Of the scheduler, HOST:PORT.
+
+    Raises:
+        SystemFailedError: No scheduler answers there, or it has no worker.
+        VersionsDifferError: A worker has other versions.
+    """
+    try:
+        import distributed
+    except ModuleNotFoundError:
+        raise missing_extra("distributed", "cluster", "--on dask://") from None
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what is lost is said by us
+    try:
+        client = distributed.Client(f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise SystemFailedError(
+            f"no dask scheduler answers at {address} ({error}); start one there with: dask scheduler"
+        ) from None
+    with client:
+        _prepare(client, address)
+        topic = f"elastic-{uuid.uuid4().hex}"
+        pool = Pool(_Cluster(client), _LogEvent(topic))
+        client.subscribe_topic(topic, _into(pool.events))
+        try:
+            yield pool
+        finally:
+            with suppress(Exception):  # the scheduler may be gone
+                client.unsubscribe_topic(topic)
+            pool.executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _prepare(client: Any, address: str) -> None:
+    """Wait for a worker, compare versions, and have calls moved no more often than we say."""
+    try:
+        client.wait_for_workers(1, timeout=_WORKER_S)
+        found = client.run(everything)
+        client.run_on_scheduler(_limit_moves, most=MOST_MOVES)
+    except TimeoutError:
+        raise SystemFailedError(
+            f"the dask scheduler at {address} had no worker within {_WORKER_S} s; start one with: "
+            f"dask worker {address} --nthreads 1"
+        ) from None
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            f"the dask cluster at {address} has no module {error.name!r}; install elastic-env on its scheduler and its "
+            "workers"
+        ) from None
+    for worker, versions in found.items():
+        require_same(everything(), versions, worker)
+
+
+def _limit_moves(most: int, dask_scheduler: Any = None) -> None:
+    """On the scheduler: a call that has lost its worker more often is given up."""
+    dask_scheduler.allowed_failures = min(dask_scheduler.allowed_failures, most)
+
+
+class _Cluster(Executor):
+    """A dask client as an executor, whose futures raise our errors."""
+
+    def __init__(self, client: Any) -> None:
+        self._client, self._executor = client, client.get_executor(pure=False)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """See `Executor`."""
+        inner, outer = self._executor.submit(fn, *args, **kwargs), Future[Any]()
+        inner.add_done_callback(lambda _: _settle(inner, outer))
+        outer.add_done_callback(lambda _: outer.cancelled() and inner.cancel())
+        return outer
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """See `Executor`."""
+        with suppress(Exception):  # the scheduler may be gone
+            self._executor.shutdown(wait and not cancel_futures)
+
+
+def _settle(inner: "Future[Any]", outer: "Future[Any]") -> None:
+    """Give a future what came of another one."""
+    if outer.cancelled() or not outer.set_running_or_notify_cancel():
+        return
+    try:
+        outer.set_result(inner.result())
+    except CancelledError:
+        outer.set_exception(PlaceLostError("the dask scheduler is gone, or it has dropped the calls"))
+    except Exception as error:
+        lost = type(error).__name__ == "KilledWorker"
+        outer.set_exception(WorkerKilledError() if lost else error)
+
+
+class _LogEvent:
+    """Reports as events of dask, from a worker by its scheduler to the client."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+
+    def __call__(self, number: int, value: Any) -> None:
+        from distributed import get_worker
+
+        get_worker().log_event(self._topic, (number, value))
+
+
+def _into(events: "queue.SimpleQueue[Any]") -> Callable[[Any], None]:
+    def take(event: Any) -> None:
+        number, value = event[1]
+        events.put((number, value))
+
+    return take

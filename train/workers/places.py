@@ -1,0 +1,70 @@
+"""Where calls run, as `--on` names it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError, shown
+from train.workers.calls import Pool
+from train.workers.dask_cluster import dask_pool
+from train.workers.local import local_pool, require_jobs
+from train.workers.slurm import SlurmConfig, slurm_pool
+
+LOCAL = "local"
+_DASK, _SLURM = "dask://", "slurm"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where calls run.
+
+    Attributes:
+        on: local, dask://HOST:PORT, slurm, or slurm:FILE.yaml with a `SlurmConfig`.
+        jobs: Processes of this machine, 0 for one per core; elsewhere the cluster says how many.
+
+    Raises:
+        ConfigurationError: There is no such place.
+    """
+
+    on: str = LOCAL
+    jobs: int = 0
+
+    def __post_init__(self) -> None:
+        require_jobs(self.jobs)
+        host, _, port = self.on.removeprefix(_DASK).rpartition(":")
+        is_dask = self.on.startswith(_DASK) and host and port.isdecimal()
+        if not (self.is_local or is_dask or self.on == _SLURM or self.on.startswith(f"{_SLURM}:")):
+            raise ConfigurationError(
+                f"on must be {LOCAL}, {_DASK}HOST:PORT of a scheduler, {_SLURM}, or {_SLURM}:FILE.yaml with what a job "
+                f"asks for, got {shown(self.on)}"
+            )
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is this machine."""
+        return self.on == LOCAL
+
+    @contextmanager
+    def opened(self, calls: int, folder: Path) -> Iterator[Pool]:
+        """Its workers.
+
+        Args:
+            calls: How many calls there will be.
+            folder: A folder of the run, in which jobs of Slurm have their files.
+        """
+        if self.is_local:
+            pool = local_pool(self.jobs, calls)
+        elif self.on.startswith(_DASK):
+            pool = dask_pool(self.on.removeprefix(_DASK))
+        else:
+            _, _, file = self.on.partition(":")
+            config = load_yaml(Path(file), SlurmConfig) if file else SlurmConfig()
+            pool = slurm_pool(config, folder / "jobs")
+        with pool as workers:
+            yield workers
+
+
+HERE = Place()
+"""The cores of this machine."""

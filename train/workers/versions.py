@@ -1,0 +1,70 @@
+"""What results depend on besides their configuration: our sources, and the libraries that calculate."""
+
+import functools
+import hashlib
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+
+from elastic_env.core.errors import ConfigurationError
+
+_ROOT = Path(__file__).parents[2]
+_PHYSICS = ("elastic_env", "baselines", "train/evaluate")
+"""Folders of the sources that a cell depends on: plant, policies, scores."""
+_ALL = ("elastic_env", "baselines", "train")
+_LIBRARIES = ("numpy", "scipy", "mujoco", "pin", "numba", "gymnasium")
+
+
+class VersionsDifferError(ConfigurationError):
+    """Two machines have other versions."""
+
+
+@functools.cache
+def physics() -> dict[str, str]:
+    """Versions that the figures of a cell depend on, by name."""
+    return {"sources of the physics": _digest(_PHYSICS), **_installed()}
+
+
+@functools.cache
+def everything() -> dict[str, str]:
+    """Versions that all machines of a run must have in common, by name."""
+    return {"sources of elastic-env": _digest(_ALL), **_installed()}
+
+
+def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str) -> None:
+    """Refuse a machine with other versions.
+
+    Raises:
+        VersionsDifferError: It has; the message names what differs, with both versions.
+    """
+    names = dict.fromkeys([*ours, *theirs])
+    different = [f"{n} {theirs.get(n)} there, {ours.get(n)} here" for n in names if ours.get(n) != theirs.get(n)]
+    if different:
+        raise VersionsDifferError(
+            f"all machines must have the same versions, but on {where} they differ: {'; '.join(different)}; install "
+            "the same commit with the same constraints.txt"
+        )
+
+
+def _installed() -> dict[str, str]:
+    """Python and the libraries that calculate."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in _LIBRARIES}}
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "none"
+
+
+def _digest(folders: Sequence[str]) -> str:
+    """SHA-256 digest of modules and tables in some folders, with their paths; its first 16 characters."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for file in sorted((_ROOT / folder).rglob("*")):
+            if file.suffix in (".py", ".csv"):
+                digest.update(f"{file.relative_to(_ROOT).as_posix()}\0".encode())
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]
