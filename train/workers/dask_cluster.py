@@ -80,35 +80,45 @@ def _limit_moves(most: int, dask_scheduler: Any = None) -> None:
 
 
 class _Cluster(Executor):
-    """A dask client as an executor, whose futures raise our errors."""
+    """A dask client as an executor.
+
+    Dask's own executor keeps every result in the memory of its worker until the end. When the worker is lost, dask
+    makes such results anew. Here a result is released as soon as it has arrived.
+    """
 
     def __init__(self, client: Any) -> None:
-        self._client, self._executor = client, client.get_executor(pure=False)
+        self._client, self._futures = client, set[Any]()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """See `Executor`."""
-        inner, outer = self._executor.submit(fn, *args, **kwargs), Future[Any]()
-        inner.add_done_callback(lambda _: _settle(inner, outer))
-        outer.add_done_callback(lambda _: outer.cancelled() and inner.cancel())
-        return outer
+        future, ours = self._client.submit(fn, *args, **kwargs, pure=False), Future[Any]()
+        self._futures.add(future)
+        future.add_done_callback(lambda done: self._settle(done, ours))
+        ours.add_done_callback(lambda _: future.cancel() if ours.cancelled() else None)
+        return ours
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """See `Executor`."""
+        futures = list(self._futures)
         with suppress(Exception):  # the scheduler may be gone
-            self._executor.shutdown(wait and not cancel_futures)
+            if cancel_futures:
+                self._client.cancel(futures)
+            elif wait:
+                for future in futures:
+                    future.exception()
 
-
-def _settle(inner: "Future[Any]", outer: "Future[Any]") -> None:
-    """Give a future what came of another one."""
-    if outer.cancelled() or not outer.set_running_or_notify_cancel():
-        return
-    try:
-        outer.set_result(inner.result())
-    except CancelledError:
-        outer.set_exception(PlaceLostError("the dask scheduler is gone, or it has dropped the calls"))
-    except Exception as error:
-        lost = type(error).__name__ == "KilledWorker"
-        outer.set_exception(WorkerKilledError() if lost else error)
+    def _settle(self, future: Any, ours: "Future[Any]") -> None:
+        """In dask's thread for it: hand on what came of a call, and release it."""
+        try:
+            if ours.set_running_or_notify_cancel():
+                ours.set_result(future.result())
+        except CancelledError:
+            ours.set_exception(PlaceLostError("the dask scheduler is gone, or it has dropped the calls"))
+        except Exception as error:
+            lost = type(error).__name__ == "KilledWorker"
+            ours.set_exception(WorkerKilledError() if lost else error)
+        self._futures.discard(future)
+        future.release()
 
 
 class _LogEvent:
