@@ -9,7 +9,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.robots.testbed import NAME
-from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
+from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, imu_arm, rigid_spec
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.joint_config import JointConfig, require_torque
 from elastic_env.runtime.joint_task import JointPlant
@@ -52,6 +52,7 @@ def plant(config: TestbedConfig) -> JointPlant:
         name=NAME, model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
         true=robot_model(joint, pendulum), static_torque=pendulum.torque,
         rest_angle=partial(_rest_angle, joint=joint, pendulum=pendulum), home=np.zeros(1),
+        imu_arm_m=imu_arm(pendulum),
     )  # fmt: skip
 
 
