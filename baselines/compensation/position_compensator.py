@@ -196,7 +196,7 @@ class PositionCompensator:
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
             step, _ = _solved(factors, pivots, residual)
             q = q - step
-            if np.abs(residual).max() < _LAST_STEP_RAD:
+            if residual.dot(residual) < _LAST_STEP_RAD**2:
                 return q
         raise self._overcome(shown_angle, np.abs(residual))
 
