@@ -41,33 +41,22 @@ class Tree:
             data.qpos[model.joint(name).qposadr[0]] = position
         mujoco.mj_kinematics(model, data)  # all that moves is where it is drawn
         moving = sorted(model.joint(name).id for name in joints)
-        links, carrier = np.zeros(1 + len(moving), LINK), _carriers(model, moving)
-        R, p = np.empty((len(links), 3, 3)), np.zeros((len(links), 3))
-        R[0] = np.eye(3)
-        for i, j in enumerate(moving, start=1):
-            body, name = int(model.jnt_bodyid[j]), model.joint(j).name
-            is_first = i == 1 or model.jnt_bodyid[moving[i - 2]] != body
-            parent = carrier[model.body_parentid[body]] if is_first else i - 1
-            R[i], p[i] = _frame_about(data.xaxis[j]), data.xanchor[j]
-            links[i]["parent"], links[i]["column"], links[i]["zero"] = (
-                parent,
-                list(joints).index(name),
-                _drawn_at(model, j),
-            )
-            links[i]["R"][:], links[i]["anchor"][:] = R[parent].T @ R[i], R[parent].T @ (p[i] - p[parent])
-        R_lw = R[carrier].transpose(0, 2, 1)
-        found = cls(
-            links,
-            carrier,
-            place=_turned(R_lw, data.xpos - p[carrier]),
-            R=R_lw @ data.xmat.reshape(-1, 3, 3),
-        )
-        inertial_R, com = R_lw @ data.ximat.reshape(-1, 3, 3), _turned(R_lw, data.xipos - p[carrier])
+        carrier = _carriers(model, moving)
+        R_wl = np.stack([np.eye(3), *(_frame_about(data.xaxis[j]) for j in moving)])
+        p_wl = np.stack([np.zeros(3), *(data.xanchor[j] for j in moving)])
+        R_lw = R_wl[carrier].transpose(0, 2, 1)
+        links = _jointed(model, joints, moving, carrier)
+        for i in range(1, len(links)):
+            parent = links[i]["parent"]
+            links[i]["R"] = R_wl[parent].T @ R_wl[i]
+            links[i]["anchor"] = R_wl[parent].T @ (p_wl[i] - p_wl[parent])
+        com, R_li = _turned(R_lw, data.xipos - p_wl[carrier]), R_lw @ data.ximat.reshape(-1, 3, 3)
         for b in range(1, model.nbody):
-            inertia = inertial_R[b] @ np.diag(model.body_inertia[b]) @ inertial_R[b].T
+            inertia = R_li[b] @ np.diag(model.body_inertia[b]) @ R_li[b].T
             share = 1.0 - float(model.body_gravcomp[b]) if gravcomp else 1.0
             _add(links[carrier[b]], float(model.body_mass[b]), com[b], inertia, share)
-        return found
+        place = _turned(R_lw, data.xpos - p_wl[carrier])
+        return cls(links, carrier, place, R_lw @ data.xmat.reshape(-1, 3, 3))
 
     def loaded(self, body: int, mass: float, place: Array) -> Any:
         """The links with one point mass more, in the frame of a body [kg], [m]."""
@@ -85,6 +74,18 @@ def _carriers(model: mujoco.MjModel, moving: Sequence[int]) -> list[int]:
     return carrier
 
 
+def _jointed(model: mujoco.MjModel, joints: Sequence[str], moving: Sequence[int], carrier: Sequence[int]) -> Any:
+    """Links that know their parents and their joints, without frames and masses."""
+    links = np.zeros(1 + len(moving), LINK)
+    for i, j in enumerate(moving, start=1):
+        body = int(model.jnt_bodyid[j])
+        is_first = i == 1 or model.jnt_bodyid[moving[i - 2]] != body
+        links[i]["parent"] = carrier[model.body_parentid[body]] if is_first else i - 1
+        links[i]["column"] = list(joints).index(model.joint(j).name)
+        links[i]["zero"] = model.qpos0[model.jnt_qposadr[j]]
+    return links
+
+
 def _add(link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0) -> None:
     """Give a link a further mass, with its inertia about its center of mass, and a share of its weight."""
     link["mass"] += mass
@@ -92,10 +93,6 @@ def _add(link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weigh
     link["inertia"] += inertia + mass * ((com @ com) * np.eye(3) - np.outer(com, com))
     link["weight"] += weight_share * mass
     link["weight_moment"] += weight_share * mass * com
-
-
-def _drawn_at(model: mujoco.MjModel, joint: int) -> float:
-    return float(model.qpos0[model.jnt_qposadr[joint]])
 
 
 def _frame_about(axis: Array) -> Array:
