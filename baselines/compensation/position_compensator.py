@@ -9,7 +9,6 @@ inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowe
 are not in it. What a motor encoder shows is turned into the link angle by Eq. 10.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import get_lapack_funcs
 
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
@@ -31,6 +31,7 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
 _MOST_ITERATIONS = 50
+_factored, _solved = get_lapack_funcs(("getrf", "getrs"))  # without the checks of lu_factor, which take longer
 
 
 class PositionCompensator:
@@ -72,8 +73,7 @@ class PositionCompensator:
         self.joints = tuple(_hinges(model) if joints is None else joints)
         held = _held(model, self.joints)
         _require_known_torque(model, held)
-        self._body = RigidBody(model, self.joints, held)
-        self._floating = _floated(model, self.joints, held)
+        self._body = RigidBody(model, self.joints, held, gravcomp=True)
         at = [int(model.joint(name).id) for name in self.joints]
         self._spring = model.jnt_stiffness[at].copy()
         self._has_springs = bool(self._spring.any())
@@ -188,15 +188,15 @@ class PositionCompensator:
         gradient.flat[:: len(shown_angle) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at θ alone, for speed;
         # the first step is Eq. 12
-        try:
-            inverse = np.linalg.inv(gradient)
-        except np.linalg.LinAlgError:
-            raise self._overcome(shown_angle, np.abs(self._gradient(shown_angle)).max(axis=1)) from None
+        factors, pivots, is_singular = _factored(gradient)
+        if is_singular:
+            raise self._overcome(shown_angle, np.abs(self._gradient(shown_angle)).max(axis=1))
         q, residual = shown_angle, shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
-            q = q - inverse @ residual
-            if np.abs(residual).max() < _LAST_STEP_RAD:
+            step, _ = _solved(factors, pivots, residual)
+            q = q - step
+            if residual.dot(residual) < _LAST_STEP_RAD**2:
                 return q
         raise self._overcome(shown_angle, np.abs(residual))
 
@@ -237,14 +237,10 @@ class PositionCompensator:
             torque = self._body.inverse_dynamics(
                 q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot
             )
-        if self._floating is not None:
-            torque -= self._floating.gravity_torque(q)
         return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
 
     def _gradient(self, q: Array) -> Array:
         gradient = self._body.gravity_gradient(q)
-        if self._floating is not None:
-            gradient -= self._floating.gravity_gradient(q)
         gradient.flat[:: len(q) + 1] += self._spring
         return gradient
 
@@ -304,15 +300,6 @@ def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> N
             )
     if model.tendon_stiffness.any() or model.tendon_stiffnesspoly.any():
         raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
-
-
-def _floated(model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, float]) -> RigidBody | None:
-    """The weight that `gravcomp` of the bodies carries, as a robot of its own; None where there is none."""
-    if not model.body_gravcomp.any():
-        return None
-    carried = copy.copy(model)
-    carried.body_mass[:] = model.body_mass * model.body_gravcomp
-    return RigidBody(carried, joints, held)
 
 
 def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
