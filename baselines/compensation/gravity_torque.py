@@ -13,6 +13,7 @@ from baselines.compensation.contact_torque import ContactGravity, ContactMethod,
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.dynamics.tree_torque import TreeTorque, needs_more_than_gravity
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 GravityMethod = Literal["hinge", "tree", "com", "ankle", "lumped"]
@@ -45,7 +46,7 @@ class FixedDynamics:
     """Inverse dynamics of a robot on a fixed base."""
 
     def __init__(self, model: RobotModel) -> None:
-        body = HingeTorque(model) if len(model.joint_names) == 1 else RigidBody(model.rigid, model.joint_names)
+        body = HingeTorque(model) if _is_plain_hinge(model) else TreeTorque(model.rigid, model.joint_names)
         self.inverse_dynamics = body.inverse_dynamics
 
     def at(self, rows: Array) -> "FixedDynamics":  # noqa: ARG002  a walker's
@@ -69,11 +70,21 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
         return ContactGravity(model, chosen)
     methods: dict[str, Callable[[RobotModel], GravityModel]] = {
         "hinge": HingeTorque,
-        "tree": lambda model: RigidBody(model.rigid, model.joint_names),
+        "tree": lambda model: TreeTorque(model.rigid, model.joint_names),
     }
-    chosen = method or ("hinge" if len(model.joint_names) == 1 else "tree")
+    chosen = method or ("hinge" if _is_plain_hinge(model) else "tree")
     require_known("gravity method", [chosen], methods)
+    if chosen != "tree" and needs_more_than_gravity(model.rigid):
+        raise ConfigurationError(
+            f"gravity method {chosen!r} knows gravity alone, and this model has springs of joints or gravcomp; "
+            "choose tree"
+        )
     return FixedGravity(methods[chosen](model))
+
+
+def _is_plain_hinge(model: RobotModel) -> bool:
+    """Whether the closed form of one hinge holds."""
+    return len(model.joint_names) == 1 and not needs_more_than_gravity(model.rigid)
 
 
 def make_load(model: RobotModel, output: str, gravity: Any) -> Any:

@@ -21,7 +21,7 @@ from scipy.linalg import get_lapack_funcs
 
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.motion.trajectory import minimum_jerk
 
@@ -73,11 +73,8 @@ class PositionCompensator:
         self.joints = tuple(_hinges(model) if joints is None else joints)
         held = _held(model, self.joints)
         _require_known_torque(model, held)
-        self._body = RigidBody(model, self.joints, held, gravcomp=True)
+        self._links = TreeTorque(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
-        self._spring = model.jnt_stiffness[at].copy()
-        self._has_springs = bool(self._spring.any())
-        self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
         self._highest = np.where(limited, model.jnt_range[at, 1], np.inf)
@@ -108,7 +105,7 @@ class PositionCompensator:
         self._count = 0
         self._load = self._load_wanted = self._load_step = 0.0
         self._carrier, self._place = self._tip, np.zeros(3)
-        self._body.set_load(self._carrier, 0.0, self._place)
+        self._links.set_load(self._carrier, 0.0, self._place)
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
     def set_payload(self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None) -> None:
@@ -135,7 +132,7 @@ class PositionCompensator:
         self._load_wanted, self._load_step = mass, abs(mass - self._load) / self._steps
         if self._ramp == 0.0:
             self._load = mass
-        self._body.set_load(self._carrier, self._load, self._place)
+        self._links.set_load(self._carrier, self._load, self._place)
 
     def torque(
         self, q: npt.ArrayLike, q_dot: npt.ArrayLike | None = None, q_ddot: npt.ArrayLike | None = None
@@ -184,13 +181,13 @@ class PositionCompensator:
             ElasticError: The load overcomes a spring.
         """
         shown_angle = self._checked("theta", theta, "rad")
-        gradient = self._compliance[:, None] * self._gradient(shown_angle)
+        gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
         gradient.flat[:: len(shown_angle) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at θ alone, for speed;
         # the first step is Eq. 12
         factors, pivots, is_singular = _factored(gradient)
         if is_singular:
-            raise self._overcome(shown_angle, np.abs(self._gradient(shown_angle)).max(axis=1))
+            raise self._overcome(shown_angle, np.abs(self._links.gravity_gradient(shown_angle)).max(axis=1))
         q, residual = shown_angle, shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
@@ -231,18 +228,9 @@ class PositionCompensator:
 
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
         if q_dot is None and q_ddot is None:
-            torque = self._body.gravity_torque(q)
-        else:
-            rest = np.zeros(len(q))
-            torque = self._body.inverse_dynamics(
-                q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot
-            )
-        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
-
-    def _gradient(self, q: Array) -> Array:
-        gradient = self._body.gravity_gradient(q)
-        gradient.flat[:: len(q) + 1] += self._spring
-        return gradient
+            return self._links.gravity_torque(q)
+        rest = np.zeros(len(q))
+        return self._links.inverse_dynamics(q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot)
 
     def _take_load(self) -> None:
         """One step towards the payload that is wanted."""
@@ -251,7 +239,7 @@ class PositionCompensator:
             self._load = (
                 self._load_wanted if abs(way) <= self._load_step else self._load + np.copysign(self._load_step, way)
             )
-            self._body.set_load(self._carrier, self._load, self._place)
+            self._links.set_load(self._carrier, self._load, self._place)
 
 
 def _hinges(model: mujoco.MjModel) -> list[str]:

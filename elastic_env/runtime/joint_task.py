@@ -72,7 +72,7 @@ class JointPlant:
         model: Compiled, with elastic joints.
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
-        rest_angle: Link angles at rest without friction, from motor angles, (..., n) [rad].
+        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad].
         home: Added to the reference of each joint, (n,) [rad].
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
             q = 0 [m]; None where there is no such IMU.
@@ -408,12 +408,13 @@ class JointTask(Stateful):
         return joint_torque(deflection, deflection_rate, model.stiffness, model.damping, model.backlash)
 
     def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
-        theta = (self._command - self._encoder_bias)[worlds]
-        q = theta if self.config.form == "rigid" else self._plant.rest_angle(theta)
+        command = (self._command - self._encoder_bias)[worlds]
+        q = self._plant.rest_angle(command)
+        torque = self._plant.static_torque(q)
+        theta = command - self._true_model.servo_compliance * torque
         simulation.qpos[np.ix_(worlds, self._at.theta)] = theta
         simulation.qpos[np.ix_(worlds, self._at.q)] = q
-        simulation.ctrl[np.ix_(worlds, self._inputs)] = theta
-        torque = self._plant.static_torque(q)
+        simulation.ctrl[np.ix_(worlds, self._inputs)] = command
         for column, servo in enumerate(self._true_model.servos):
             if servo.integral_gain > 0.0:
                 simulation.act[worlds, self._integrators[column]] = torque[:, column] / servo.integral_gain
