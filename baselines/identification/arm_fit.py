@@ -33,6 +33,7 @@ MOST_EVALUATIONS = 100
 
 _FURTHER_POSES = 3  # beyond those that are as many numbers as unknowns
 _FIRST_DEFLECTION_RAD = 0.01  # not zero: a rigid joint shows nothing of its friction
+_UNLIKE = 3.0  # ratio of how far positions spread, measured and of the model
 _OUTLYING = 5.0  # standard deviations
 
 
@@ -132,10 +133,10 @@ class _Problem:
 
 
 def require_poses(model: PoseModel) -> None:
-    """Refuse logs with fewer numbers than unknowns.
+    """Refuse logs with fewer numbers than unknowns, and positions of another unit.
 
     Raises:
-        ConfigurationError: Too few poses.
+        ConfigurationError: Too few poses, or positions that the arm cannot reach.
     """
     size, each = model.unknowns.size, model.target.shape[1]
     needed = -(-size // each) + _FURTHER_POSES
@@ -144,6 +145,23 @@ def require_poses(model: PoseModel) -> None:
             f"{size} unknowns need at least {needed} poses of {each} measured numbers each, the log has "
             f"{len(model.log)}; log further poses, or seek fewer joints by --joints"
         )
+    if model.log.kind == "end_effector":
+        _require_reach(model)
+
+
+def _require_reach(model: PoseModel) -> None:
+    """Refuse positions that spread far more or less than those of the model, such as millimetres."""
+    own, measured = (_radius(points) for points in (model.arm.attitude(model.log.theta).position, model.log.measured))
+    if not own / _UNLIKE < measured < own * _UNLIKE:
+        raise ConfigurationError(
+            f"the columns end_effector spread over {measured:.3g} m, {model.arm.end_effector!r} of the model over "
+            f"{own:.3g} m: convert millimetres to metres, or name the body that was measured by --end-effector"
+        )
+
+
+def _radius(points: Array) -> float:
+    """Root mean square distance from the mean, which does not depend on the frame [m]."""
+    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))
 
 
 def information_of(model: PoseModel, unknowns: Array, spread: float) -> tuple[Array, Array]:
@@ -180,13 +198,17 @@ def _clustered(rows: Array, residual: Array, inverse: Array) -> Array:
     return inverse @ middle @ inverse
 
 
+def in_unit(noise: float, kind: Kind) -> str:
+    """Noise of a measurement with its unit, as tables show it."""
+    unit = measurement_unit(kind)
+    return f"{noise:.3g} {unit}" if unit == "N·m" else f"{1e3 * noise:.3g} m{unit}"
+
+
 def summed_up(fit: ArmFit) -> str:
     """The residuals in a sentence, with what friction means for the intervals."""
-    unit = measurement_unit(fit.model.log.kind)
-    size = {"m": f"{1e3 * fit.spread:.3g} mm", "rad": f"{1e3 * fit.spread:.3g} mrad"}.get(unit, f"{fit.spread:.3g} N·m")
     friction = (
         "friction is separated by the sides of approach"
         if fit.model.log.direction is not None
         else "the log has no sides of approach: friction counts as noise, and the intervals contain it"
     )
-    return f"residual spread {size}; {friction}"
+    return f"residual spread {in_unit(fit.spread, fit.model.log.kind)}; {friction}"

@@ -15,6 +15,7 @@ from elastic_env.core.signals import Array, BoolArray
 Source = Literal["told apart", "wide interval", "assumed"]
 """Where the stiffness of a joint comes from: a narrow interval, as asked for, a wider one, or no bounded one."""
 
+_SHOWN = 0.05  # of the largest derivative of the measurement by a joint: gravity couples the others by less
 _ALIKE = 0.95  # correlation of two unknowns that the poses hardly tell apart
 
 
@@ -143,7 +144,7 @@ def _unseen(fit: ArmFit) -> BoolArray:
     """Which elastic joints do not move the measurement, (k,)."""
     _, gradient = fit.model.predicted(fit.unknowns)
     moved = np.abs(gradient[..., fit.model.unknowns.slices["offset"]]).max(axis=(0, 1))
-    return moved < SMALLEST_LOAD * moved.max()
+    return moved < _SHOWN * moved.max()
 
 
 def _alike(fit: ArmFit) -> BoolArray:

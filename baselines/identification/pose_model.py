@@ -34,7 +34,7 @@ SMALLEST_LOAD = 1e-3
 """Share of the largest torque in the arm below which a joint counts as not loaded."""
 
 _PRIOR = {"offset": 0.3, "payload_kg": 10.0, "translation_m": 1.0, "rotation_rad": 0.3}
-_MOST_ITERATIONS, _LAST_STEP_RAD = 50, 1e-12
+_FIRST_ITERATIONS, _MOST_ITERATIONS, _LAST_STEP_RAD = 6, 50, 1e-12
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,11 @@ class PoseModel:
         """
         theta = self.log.theta - self.expand(unknowns, "offset")
         compliance = self.expand(unknowns, "compliance")
-        q = theta - compliance * self.torque(unknowns, theta)
+        q = theta
+        for _ in range(
+            _FIRST_ITERATIONS
+        ):  # shrink the error by about τ′/K each, so that derivatives are taken in place
+            q = theta - compliance * self.torque(unknowns, q)
         gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns))
         inverse = np.linalg.inv(np.eye(len(compliance)) + compliance[:, None] * gradient)
         for _ in range(_MOST_ITERATIONS):

@@ -75,7 +75,7 @@ class Identify:
             names = ", ".join(
                 "--port and the like" if name == "on" else f"--{name.replace('_', '-')}" for name in others
             )
-            raise ConfigurationError(f"{names} belong to the testbed; leave them out beside --robot and --log")
+            raise ConfigurationError(f"options of the testbed: {names}; leave them out beside --robot and --log")
         with options_named():
             config = IdentifyArmConfig(**self.arm.given, seed=self.seed)
         run_arm_identification(config, CONSOLE, self.output)

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from baselines.identification.arm_fit import MOST_EVALUATIONS, ArmFit, fit_arm, summed_up
+from baselines.identification.arm_fit import MOST_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
 from baselines.identification.arm_result import ArmIdentification, JointStiffness, described
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
@@ -61,7 +61,7 @@ class IdentifyArmConfig(Model):
     def _something_to_do(self) -> Self:
         if self.log is None and (not self.plan or self.measured_by is None):
             raise ValueError(
-                "log is missing: give the CSV file of static poses, or plan the first poses by --plan 40 --measured-by "
+                "give the CSV file of static poses by --log, or plan the first poses by --plan 40 --measured-by "
                 "end_effector (or link_encoders, imu, torques)"
             )
         return self
@@ -125,10 +125,10 @@ def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
     has_friction, has_plan = not result.friction_is_noise, result.joints[0].planned_half_width is not None
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
-    table = Table(title=title, box=box.SIMPLE)
+    table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0))
     table.add_column("joint", no_wrap=True)
-    heads = ["K", "95 % interval", "±", *["± with plan"] * has_plan, *["friction\n[N·m]"] * has_friction]
-    for head in [*heads, "offset\n[mrad]"]:
+    heads = ["K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction]
+    for head in [*heads, "o [mrad]"]:
         table.add_column(head, justify="right", no_wrap=True)
     for joint in result.joints:
         cells = [*_stiffness_cells(joint), *[_percent(joint.planned_half_width)] * has_plan]
@@ -191,7 +191,10 @@ def _setting(config: IdentifyArmConfig, model: mujoco.MjModel, console: Console)
         log = empty_log(arm, config.measured_by or "end_effector")
     if config.end_effector is None and log.kind in ("end_effector", "imu"):
         console.print(f"measured is taken to be {arm.end_effector!r}; --end-effector names another site or body")
-    return _Setting(arm, log, _sought(config.joints, log.joints))
+    setting = _Setting(arm, log, _sought(config.joints, log.joints))
+    if config.log is not None:
+        require_poses(setting.model(config))
+    return setting
 
 
 def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
@@ -232,10 +235,10 @@ def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, cons
         table.add_row(escape(joint), _percent(float(width)))
     console.print(table)
     console.print(
-        f"expected for noise of {noise:g} and a deflection of {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad under the "
-        "largest gravity torque of each joint; half the deflection doubles it",
+        f"expected for noise of {in_unit(noise, setting.log.kind)} and {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad of "
+        "deflection under the largest gravity torque of each joint; half the deflection doubles it",
         highlight=False,
-    )  # fmt: skip
+    )
     console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True, markup=False)
 
 
