@@ -18,7 +18,7 @@ from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
 from baselines.identification.arm_result import described
 from baselines.identification.pose_log import Kind, PoseLog, read_log
 from baselines.identification.pose_model import PoseModel, Unknowns
-from baselines.identification.pose_plan import candidate_poses, plan_poses
+from baselines.identification.pose_plan import candidate_poses, plan_further
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import ConfigurationError
 from elastic_env.core.errors import ElasticError
@@ -247,7 +247,7 @@ def test_planned_poses_tell_more_than_random_ones_and_are_free() -> None:
     log = log_of("end_effector", 10, sides=True)
     fit = fit_arm(model_of(log))
     candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(11))
-    plan = plan_poses(fit.model, fit.unknowns, fit.spread, fit.information, candidates, 10)
+    plan = plan_further(fit, candidates, 10)
     own = replace(fit.model, log=candidates)
     own.__dict__["scale"] = fit.model.scale
     rows, _ = information_of(own, fit.unknowns, fit.spread)
@@ -275,7 +275,7 @@ def test_plan_says_in_advance_what_its_poses_then_tell() -> None:
     log = log_of("end_effector", 12)
     fit = fit_arm(model_of(log))
     candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(13))
-    plan = plan_poses(fit.model, fit.unknowns, fit.spread, fit.information, candidates, 40)
+    plan = plan_further(fit, candidates, 40)
     expected = [j.planned_half_width for j in described(fit, 0.03, None, plan.information).joints]
     further = log_of("end_effector", 14, theta=plan.theta)
     both = replace(

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from baselines.identification.arm_fit import information_of
+from baselines.identification.arm_fit import ArmFit, information_of
 from baselines.identification.pose_log import AXES, Kind, PoseLog
 from baselines.identification.pose_model import PoseModel
 from baselines.identification.static_arm import StaticArm
@@ -71,6 +71,11 @@ def plan_poses(
     chosen = _chosen(rows, information, count, len(model.unknowns.elastic))
     direction = None if candidates.direction is None else candidates.direction[chosen]
     return PosePlan(candidates.theta[chosen], direction, _with(information, rows[chosen]))
+
+
+def plan_further(fit: ArmFit, candidates: PoseLog, count: int) -> PosePlan:
+    """Choose poses that add most to what a log has told; arguments as `plan_poses`."""
+    return plan_poses(fit.model, fit.unknowns, fit.spread, fit.information, candidates, count)
 
 
 def candidate_poses(arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, generator: np.random.Generator) -> PoseLog:

@@ -18,11 +18,17 @@ from baselines.identification.arm_fit import MOST_EVALUATIONS, ArmFit, fit_arm, 
 from baselines.identification.arm_result import ArmIdentification, JointStiffness, described
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
-from baselines.identification.pose_plan import MOST_PLANNED, PosePlan, candidate_poses, empty_log, plan_poses
+from baselines.identification.pose_plan import (
+    MOST_PLANNED,
+    PosePlan,
+    candidate_poses,
+    empty_log,
+    plan_further,
+    plan_poses,
+)
 from baselines.identification.static_arm import StaticArm, hinges_of
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
 from elastic_env.core.errors import unknown_name
-from elastic_env.core.signals import Array
 from elastic_env.joint.model_file import compiled_model
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
@@ -106,9 +112,7 @@ def run_arm_identification(
             return None
         with show_progress(console, {"fitting, steps": MOST_EVALUATIONS}, transient=True) as show:
             fit = fit_arm(setting.model(config), lambda done: show(0, done))
-        plan = (
-            _planned(config, setting, fit.model, (fit.unknowns, fit.spread, fit.information)) if config.plan else None
-        )
+        plan = plan_further(fit, _candidates(config, setting, console), config.plan) if config.plan else None
         result = described(fit, config.within, config.assume, None if plan is None else plan.information)
         files = result.save(folder)
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
@@ -129,7 +133,7 @@ def result_table(result: ArmIdentification) -> Table:
     table.add_column("joint", no_wrap=True)
     heads = ["K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction]
     for head in [*heads, "o [mrad]"]:
-        table.add_column(head, justify="right", no_wrap=True)
+        table.add_column(escape(head), justify="right", no_wrap=True)
     for joint in result.joints:
         cells = [*_stiffness_cells(joint), *[_percent(joint.planned_half_width)] * has_plan]
         cells += [_number(joint.friction_nm)] * has_friction + [_number(1e3 * joint.offset_rad)]
@@ -171,6 +175,14 @@ def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
     ]
 
 
+def _candidates(config: IdentifyArmConfig, setting: _Setting, console: Console) -> PoseLog:
+    """Poses to choose from; says where contacts of the arm are not known."""
+    shapes = shaped_model(config.robot)
+    if not (shapes.geom_contype.any() or shapes.geom_conaffinity.any()):
+        console.print("the model has no shapes that MuJoCo can read: check the proposed poses for contacts yourself")
+    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(config.seed))
+
+
 def shaped_model(path: str) -> mujoco.MjModel:
     """The model with its collision shapes; that of `compiled_model` where MuJoCo cannot read the shapes."""
     try:
@@ -210,19 +222,9 @@ def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(joint for joint in joints if not patterns or any(fnmatchcase(joint, p) for p in patterns))
 
 
-def _planned(
-    config: IdentifyArmConfig, setting: _Setting, model: PoseModel, known: tuple[Array, float, Array]
-) -> PosePlan:
-    """Poses beyond those that are known: estimates, noise and information."""
-    generator = np.random.default_rng(config.seed)
-    candidates = candidate_poses(setting.arm, shaped_model(config.robot), setting.log, generator)
-    return plan_poses(model, *known, candidates, config.plan)
-
-
 def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, console: Console) -> None:
     """Plan without a log: with usual noise, and deflections of a usual size."""
-    generator = np.random.default_rng(config.seed)
-    candidates = candidate_poses(setting.arm, shaped_model(config.robot), setting.log, generator)
+    candidates = _candidates(config, setting, console)
     model, noise = setting.model(config, candidates), _USUAL_NOISE[setting.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
     plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, config.plan)
