@@ -28,6 +28,7 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from train.commands.cli import main
+from train.figures.arm_plots import deflections
 
 FOLDER = Path(__file__).parents[1] / "docs" / "identification"
 ARM = mujoco.MjModel.from_xml_path(str(FOLDER / "arm.xml"))
@@ -270,14 +271,15 @@ def test_planned_poses_tell_more_than_random_ones_and_are_free() -> None:
     assert set(np.unique(plan.direction)) == {-1.0, 1.0}
 
 
-def test_plan_says_in_advance_what_its_poses_then_tell() -> None:
+@pytest.mark.parametrize("kind", ["end_effector", "imu"])
+def test_plan_says_in_advance_what_its_poses_then_tell(kind: Kind) -> None:
     """Catches an information in other units, or one that leaves the log out."""
-    log = log_of("end_effector", 12)
+    log = log_of(kind, 12)
     fit = fit_arm(model_of(log))
     candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(13))
     plan = plan_further(fit, candidates, 40)
     expected = [j.planned_half_width for j in described(fit, 0.03, None, plan.information).joints]
-    further = log_of("end_effector", 14, theta=plan.theta)
+    further = log_of(kind, 14, theta=plan.theta)
     both = replace(
         log,
         theta=np.concatenate([log.theta, further.theta]),
@@ -285,6 +287,21 @@ def test_plan_says_in_advance_what_its_poses_then_tell() -> None:
     )
     then = [joint.half_width for joint in described(fit_arm(model_of(both)), 0.03, None).joints]
     np.testing.assert_allclose(then[1:], np.array(expected, dtype=float)[1:], rtol=0.35)
+
+
+@pytest.mark.parametrize("kind", ["end_effector", "link_encoders"])
+def test_figure_shows_the_deflections_of_the_springs(kind: Kind) -> None:
+    """Catches deflections in another sign or unit, and residuals that are taken away in place of added."""
+    log = log_of(kind, 17)
+    exact = equilibria(log.theta - OFFSET, np.zeros_like(log.theta))
+    fit = fit_arm(model_of(log))
+    predicted, measured = deflections(fit)
+    true = (log.theta - OFFSET - exact)[:, LOADED]
+    np.testing.assert_allclose(predicted[:, LOADED], true, atol=3e-3)
+    assert np.std(predicted[:, LOADED] - true) < 1e-3
+    if kind == "link_encoders":
+        direct = log.theta - fit.estimate("offset")[0] - log.measured
+        np.testing.assert_allclose(measured[:, LOADED], direct[:, LOADED], atol=1e-4)
 
 
 # From here on the command, its files, and what it refuses.

@@ -179,8 +179,8 @@ class PoseModel:
             if not np.abs(step).max() > _LAST_STEP_RAD:
                 return q, inverse
         raise ElasticError(
-            "no link angles for these poses: gravity overcomes the springs that the log implies; check signs, zeros "
-            "and units of its columns, and the masses of the model"
+            "no link angles for these poses: gravity overcomes the springs that the log implies; check signs, zeros, "
+            "units and frame (--frame) of its columns, and the masses of the model"
         )
 
     def predicted(self, unknowns: Array) -> tuple[Array, Array]:
@@ -253,6 +253,12 @@ def vertical(attitude: Array) -> Array:
     """
     roll, pitch = attitude[..., 0], attitude[..., 1]
     return np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1)
+
+
+def roll_and_pitch(direction: Array) -> Array:
+    """The inverse of `vertical`, (N, 3) to (N, 2) [rad]."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    return np.stack([np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))], axis=-1)
 
 
 def measurement_unit(kind: Kind) -> str:

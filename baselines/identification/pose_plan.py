@@ -19,7 +19,7 @@ import numpy as np
 
 from baselines.identification.arm_fit import ArmFit, information_of
 from baselines.identification.pose_log import AXES, Kind, PoseLog
-from baselines.identification.pose_model import PoseModel
+from baselines.identification.pose_model import PoseModel, roll_and_pitch
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, IntArray
@@ -108,14 +108,22 @@ def candidate_poses(arm: StaticArm, shapes: mujoco.MjModel, like: PoseLog, gener
             )
     theta = np.array(poses)
     sides = None if like.direction is None else generator.choice([-1.0, 1.0], size=theta.shape)
-    measured = np.zeros((len(theta), len(like.columns)))
-    return PoseLog(arm.joints, theta, like.kind, like.columns, measured, sides)
+    return PoseLog(arm.joints, theta, like.kind, like.columns, _rigid_measurement(arm, like, theta), sides)
 
 
 def empty_log(arm: StaticArm, kind: Kind) -> PoseLog:
     """The log of a measurement that is yet to be made, with sides of approach."""
     columns, nothing = AXES.get(kind, arm.joints), np.zeros((0, len(arm.joints)))
     return PoseLog(arm.joints, nothing, kind, columns, np.zeros((0, len(columns))), nothing)
+
+
+def _rigid_measurement(arm: StaticArm, like: PoseLog, theta: Array) -> Array:
+    """What a sensor in the model's own frame would show of rigid joints; only its directions matter, (N, m)."""
+    if like.kind == "end_effector":
+        return arm.attitude(theta).position
+    if like.kind == "imu":
+        return roll_and_pitch(arm.attitude(theta).rotation.transpose(0, 2, 1) @ arm.up)
+    return np.zeros((len(theta), len(like.columns)))
 
 
 class _Contacts:

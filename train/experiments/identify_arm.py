@@ -36,7 +36,9 @@ from train.runs.folders import run_folder
 from train.runs.workers import show_progress
 
 _USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
-"""Noise that a plan without a log assumes [m], [rad], [N·m]."""
+"""Noise of usual sensors, which a plan without a log assumes [m], [rad], [N·m]."""
+_FAR_BEYOND = 10.0
+"""Ratio of residuals and usual noise from which on the output warns."""
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
@@ -153,6 +155,12 @@ def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
         names = ", ".join(joint.joint for joint in assumed)
         lines.append(
             f"joints.yaml assumes {assumed[0].stiffness_nm_per_rad:.4g} N·m/rad for {names}; --assume changes it"
+        )
+    usual = _USUAL_NOISE[result.measurement]
+    if result.residual_spread > _FAR_BEYOND * usual:
+        lines.append(
+            f"the residuals are far beyond the usual noise of {in_unit(usual, result.measurement)}: look for other "
+            "elastic joints, another frame (--frame) or body (--end-effector), friction, and errors of the model"
         )
     if result.outlying_poses:
         lines.append(f"poses that do not fit the others: {', '.join(map(str, result.outlying_poses))}; check them")

@@ -13,6 +13,8 @@ from train.figures.plots import MRAD, require_matplotlib, save
 
 _COLUMNS = 4
 _LEAST_LEVER = 0.1  # of the largest: poses that show a joint less are left out of its panel
+_LEAST_SEEN = 0.01  # of the largest of all joints
+_MOST_NAMED = 3  # columns of a measurement that a legend names
 _DOTS, _LINE = "#2a6f97", "#888888"
 
 
@@ -46,12 +48,16 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
     # an offset turns a joint as a deflection does, so that its derivative is the lever of the deflection
     lever = model.predicted(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
     size = np.sum(lever**2, axis=1)
-    seen = size > (_LEAST_LEVER**2) * size.max(axis=0, initial=1e-30)
+    largest = size.max(axis=0)
+    seen = size > np.maximum(_LEAST_LEVER**2 * largest, _LEAST_SEEN**2 * largest.max())
     along = np.sum(lever * fit.residual[..., None], axis=1)
     return predicted, np.where(seen, predicted + along / np.where(seen, size, 1.0), np.nan)
 
 
 def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
+    if np.isnan(measured).all():
+        axis.text(0.5, 0.5, "the measurement\ndoes not show it", ha="center", transform=axis.transAxes, fontsize=9)
+        return
     axis.axline((0.0, 0.0), slope=1.0, color=_LINE, lw=0.9)
     axis.scatter(MRAD * predicted, MRAD * measured, s=14, color=_DOTS, alpha=0.8, linewidths=0, zorder=3)
 
@@ -64,7 +70,10 @@ def _draw_residuals(axis: Any, fit: ArmFit) -> None:
         axis.plot(poses, factor * column, ".", ms=4, label=name)
     axis.axhline(0.0, color=_LINE, lw=0.8)
     axis.set_title(f"residual [{shown}] by pose\nspread {factor * fit.spread:.3g} {shown}", fontsize=9)
-    axis.legend(fontsize=7, ncols=4, handletextpad=0.1, columnspacing=0.6, loc="upper right")
+    if len(_names(fit)) <= _MOST_NAMED:
+        axis.legend(fontsize=7, ncols=3, handletextpad=0.1, columnspacing=0.6, loc="upper right")
+    else:
+        axis.set_xlabel("a colour per joint, in their order", fontsize=8)
 
 
 def _names(fit: ArmFit) -> tuple[str, ...]:
