@@ -352,6 +352,20 @@ def test_example_log_is_that_of_its_script(tmp_path: Path) -> None:
     assert np.std(log.measured - markers) == pytest.approx(3e-4, rel=0.2)
 
 
+def test_samples_of_one_pose_count_once(tmp_path: Path) -> None:
+    """Catches intervals that shrink because a sensor was written down more often, and poses that are lost."""
+    head, rows = table()
+    several = [row for row in rows for _ in range(5)]
+    for number, row in enumerate(several):
+        several[number] = [str(float(row[0]) + 1e-5 * (number % 5 - 2)), *row[1:]]
+    with Path("several.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([head, *several])
+    once, often = read_log(EXAMPLE, RANGES), read_log(Path("several.csv"), RANGES)
+    np.testing.assert_allclose(often.theta, once.theta, atol=1e-12)
+    np.testing.assert_allclose(often.measured, once.measured, atol=1e-12)
+    np.testing.assert_array_equal(often.direction, once.direction)
+
+
 def table() -> tuple[list[str], list[list[str]]]:
     """Header and rows of the example."""
     head, *rows = csv.reader(EXAMPLE.read_text().splitlines())

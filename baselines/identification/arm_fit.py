@@ -29,7 +29,9 @@ from elastic_env.core.signals import Array, IntArray
 _FINEST: dict[Kind, float] = {"end_effector": 1e-4, "imu": 1e-4, "link_encoders": 1e-5, "torques": 1e-2}
 """Noise beside which the prior counts [m], [rad], [N·m]: about that of good sensors."""
 MOST_EVALUATIONS = 100
-"""Steps after which a fit gives up; ten are usual."""
+"""Steps after which a fit gives up."""
+USUAL_EVALUATIONS = 12
+"""Steps of a usual fit, at most."""
 
 _FURTHER_POSES = 3  # beyond those that are as many numbers as unknowns
 _FIRST_DEFLECTION_RAD = 0.01  # not zero: a rigid joint shows nothing of its friction

@@ -7,7 +7,7 @@ import csv
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -106,7 +106,27 @@ def read_log(path: Path, ranges: Mapping[str, tuple[float, float]], kind: Kind |
             f"all {len(log)} poses of {path} are alike: no joint moves by {_ALIKE_RAD} rad; log poses that differ in "
             "all joints, such as those that --plan proposes"
         )
-    return log
+    return averaged(log)
+
+
+def averaged(log: PoseLog) -> PoseLog:
+    """The log with consecutive rows of one pose, whose encoders and sides of approach agree, as their mean.
+
+    Their friction and the errors of the model are the same, so that they do not count as independent.
+    """
+    sides = np.zeros_like(log.theta) if log.direction is None else log.direction
+    starts = [0]
+    for row in range(1, len(log)):
+        moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _ALIKE_RAD
+        if moved or (sides[row] != sides[starts[-1]]).any():
+            starts.append(row)
+    count = np.diff([*starts, len(log)])[:, None]
+    return replace(
+        log,
+        theta=np.add.reduceat(log.theta, starts) / count,
+        measured=np.add.reduceat(log.measured, starts) / count,
+        direction=None if log.direction is None else sides[starts],
+    )
 
 
 def write_poses(path: Path, columns: Mapping[str, Array]) -> Path:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from baselines.identification.arm_fit import MOST_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
+from baselines.identification.arm_fit import USUAL_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
 from baselines.identification.arm_result import ArmIdentification, JointStiffness, described
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
@@ -112,8 +112,8 @@ def run_arm_identification(
         if config.log is None:
             _plan_first(config, setting, folder, console)
             return None
-        with show_progress(console, {"fitting, steps": MOST_EVALUATIONS}, transient=True) as show:
-            fit = fit_arm(setting.model(config), lambda done: show(0, done))
+        with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
+            fit = fit_arm(setting.model(config), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
         plan = plan_further(fit, _candidates(config, setting, console), config.plan) if config.plan else None
         result = described(fit, config.within, config.assume, None if plan is None else plan.information)
         files = result.save(folder)
