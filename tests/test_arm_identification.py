@@ -20,8 +20,7 @@ from baselines.identification.pose_log import Kind, PoseLog, read_log
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
 from baselines.identification.static_arm import StaticArm
-from elastic_env.core.config import ConfigurationError
-from elastic_env.core.errors import ElasticError
+from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.joint.elasticity import ElasticJoint
