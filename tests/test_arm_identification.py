@@ -328,7 +328,7 @@ def test_command_on_the_example_writes_what_the_compensator_takes(capsys: pytest
     stiffness = parse_yaml(Path("found/joints.yaml").read_text())
     assert stiffness["base_yaw"] == {"stiffness": 1500.0}
     np.testing.assert_allclose([own["stiffness"] for own in stiffness.values()][LOADED], K[LOADED], rtol=0.12)
-    assert PositionCompensator.from_model(FOLDER / "arm.xml", stiffness).joints == JOINTS
+    assert PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml").joints == JOINTS
     rows = list(csv.reader(Path("found/plan.csv").read_text().splitlines()))
     assert len(rows) == 6
     assert rows[0][0] == "theta.base_yaw [rad]"

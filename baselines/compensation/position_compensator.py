@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import get_lapack_funcs
 
+from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.tree_torque import TreeTorque
@@ -31,6 +32,7 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
 _MOST_ITERATIONS = 50
+_FILES = (".yaml", ".yml")
 _factored, _solved = get_lapack_funcs(("getrf", "getrs"))  # without the checks of lu_factor, which take longer
 
 
@@ -91,14 +93,17 @@ class PositionCompensator:
 
     @classmethod
     def from_model(
-        cls, model: str | Path | mujoco.MjSpec | mujoco.MjModel, stiffness: PerJoint, **options: Any
+        cls, model: str | Path | mujoco.MjSpec | mujoco.MjModel, stiffness: PerJoint | str | Path, **options: Any
     ) -> Self:
         """From a file of MJCF or URDF, or from what MuJoCo made of one; further arguments as of the class.
+
+        `stiffness` may be a file, *.yaml, such as the `joints.yaml` of `elastic identify --robot`.
 
         Raises:
             ConfigurationError: The file or a value cannot be used.
         """
-        return cls(compiled_model(model), stiffness, **options)
+        is_file = isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES
+        return cls(compiled_model(model), read_mapping(Path(stiffness)) if is_file else stiffness, **options)  # type: ignore[arg-type]
 
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""
