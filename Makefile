@@ -13,7 +13,7 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format typecheck bench clean
+.PHONY: help demo test lint format typecheck bench docs clean
 
 help: ## Show this text
 	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
@@ -49,8 +49,14 @@ bench: $(STAMP) ## Measure the speed of the simulation, then run the benchmarks 
 	$(BIN)/elastic speed
 	$(if $(wildcard tests/benchmarks),$(BIN)/python -m pytest -o addopts= --benchmark-only tests/benchmarks $(ARGS))
 
+docs: $(STAMP) ## Build the site into docs/_build/html and run the tutorials; warnings are errors
+	@$(BIN)/python -c 'import furo, myst_parser, sphinx_gallery' 2>/dev/null || \
+	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
+
 clean: ## Remove the virtual environment and all caches; results under runs/ stay
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT
+	rm -rf $(VENV) build dist docs/_build docs/generated *.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks MUJOCO_LOG.TXT
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # An existing .venv is kept if it has pip and the wanted Python, and made anew otherwise. Setuptools comes first and

@@ -27,7 +27,7 @@ class PolicyOptions(Model):
     """Output compensator: "taylor" for Eq. 12, "newton" for Eq. 10, on the walker also "wrench" and "none"; None for
     what the policy's name says."""
     gravity: GravityMethod | None = None
-    """How τ_g is computed: on the testbed "hinge", "pinocchio" or "batched", on the walker "com", "ankle" or "lumped";
+    """How τ_g is computed: on the testbed "hinge" or "tree", on the walker "com", "ankle" or "lumped";
     None for the first of them."""
     com_feedback: bool = True
     """Walker: whether the controller feeds the center of mass back."""

@@ -142,7 +142,7 @@ def test_taylor_solves_the_matrix_equation_of_a_tree() -> None:
     """Catches Eq. 12 joint by joint: (K + ∂τ_g/∂q) δ = τ_g(θ), with both sides from MuJoCo and differences."""
     K = np.array([120.0, 300.0, 90.0, 60.0, 500.0, 200.0])
     model, h = tree().with_stiffness(K), 1e-5
-    gravity = make_gravity(model, "batched")
+    gravity = make_gravity(model, "tree")
     for theta in np.random.default_rng(3).uniform(-1.0, 1.0, (10, 6)):
         columns = [bias_of_mujoco(model, theta + h * e) - bias_of_mujoco(model, theta - h * e) for e in np.eye(6)]
         gradient = np.stack(columns, axis=1) / (2.0 * h)
@@ -157,7 +157,7 @@ def test_newton_balances_the_springs_of_a_tree_against_mujoco() -> None:
     K = np.array([120.0, 300.0, 90.0, 60.0, 500.0, 200.0])
     model = tree().with_stiffness(K)
     theta = np.random.default_rng(4).uniform(-1.0, 1.0, (10, 6))
-    q = newton_link_angle(theta, K, make_gravity(model, "pinocchio"))
+    q = newton_link_angle(theta, K, make_gravity(model))
     torque = np.stack([bias_of_mujoco(model, row) for row in q])
     np.testing.assert_allclose(K * (theta - q), torque, rtol=0.0, atol=1e-9)
 

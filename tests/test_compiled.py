@@ -25,7 +25,10 @@ from elastic_env.dynamics import walk_kernels as kernels
 from elastic_env.runtime import metrics, worlds
 
 ROOT = Path(__file__).parents[1]
-KERNELS = ("elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels")
+KERNELS = (
+    "elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels",
+    "elastic_env.dynamics.tree_kernels",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", KERNELS)

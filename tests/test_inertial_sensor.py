@@ -16,6 +16,7 @@ from elastic_env.robots.thormang.environment import make_vector
 from elastic_env.robots.thormang.rows import TRUTH
 from elastic_env.runtime.scenario import make_scenario
 from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
+from tests.three_joints import ARM
 
 G = 9.81
 EXACT = InertialSensor(
@@ -282,8 +283,6 @@ def test_the_scenario_has_the_age_of_sensor() -> None:
     assert scenario.draws_robots
     assert scenario.is_random
     assert make_scenario("soft+imu").inertial == InertialSensor()
-    with pytest.raises(ConfigurationError, match="only a walker knows"):
-        gymnasium.make("elastic_env/Testbed-v0", scenario="imu")
 
 
 def test_the_default_has_the_data_sheets_error_at_rest() -> None:
@@ -294,3 +293,75 @@ def test_the_default_has_the_data_sheets_error_at_rest() -> None:
     assert math.degrees(math.hypot(by_force, by_rate)) == pytest.approx(0.118, abs=1e-3)
     with pytest.raises(ConfigurationError, match="static_error_rad must be at least"):
         InertialSensor(static_error_rad=1e-3)
+
+
+def pendulum(scenario: Any, **arguments: Any) -> Any:
+    """A testbed whose link has an IMU that computes its attitude, observed beside the accelerometer."""
+    sensors = ["link_imu", "accelerometer"]
+    return gymnasium.make("elastic_env/Testbed-v0", scenario=scenario, sensors=sensors, **arguments)
+
+
+def played(env: Any, steps: int) -> tuple[Array, list[dict[str, Any]]]:
+    """Observations and infos of an episode without compensation."""
+    observation, info = env.reset(seed=3)
+    observations, infos = [observation], [info]
+    for _ in range(steps):
+        observation, _, _, _, info = env.step(np.zeros(1, np.float32))
+        observations.append(observation)
+        infos.append(info)
+    return np.array(observations), infos
+
+
+SWING = {"kind": "sine", "amplitude": 0.3, "frequency_hz": 0.8}
+
+
+def test_the_links_accelerometer_is_that_of_mujoco() -> None:
+    """Catches a wrong arm, a wrong sign, and a rate in the place of an acceleration.
+
+    With a very short time constant the filter shows the direction of the specific force. MuJoCo's accelerometer at the
+    same site knows that force at a physics step; ours is the mean over a control period, half of one older.
+    """
+    fast = make_scenario("ideal").replace(inertial=EXACT.replace(time_constant_s=1e-3, bandwidth_hz=1.0))
+    fast = fast.replace(imu=AttitudeSensor(rate_hz=250.0))
+    seen, infos = played(pendulum(fast, reference=SWING), 900)
+    x, z = seen[:, 7], seen[:, 9]
+    by_mujoco = np.arctan2(x, z)
+    q = np.array([info["link_angle"] for info in infos])
+    half = (by_mujoco[1:] + by_mujoco[:-1]) / 2.0
+    disturbance = np.abs(by_mujoco - q).max()
+    assert disturbance > 0.1
+    assert np.abs(seen[1:, 6] - half)[5:].max() < 0.08 * disturbance
+
+
+def test_the_links_filter_without_errors_shows_the_link() -> None:
+    """Catches a gyroscope of the wrong sign or scale: with a long time constant the rate alone counts."""
+    slow = make_scenario("ideal").replace(
+        inertial=EXACT.replace(time_constant_s=1e6), imu=AttitudeSensor(rate_hz=250.0)
+    )
+    seen, infos = played(pendulum(slow, reference=SWING), 900)
+    q = np.array([info["link_angle"] for info in infos])
+    assert np.ptp(q) > 0.5
+    np.testing.assert_allclose(seen[:, 6], q, rtol=0.0, atol=1e-5)
+
+
+def test_the_links_error_at_rest_is_that_of_the_data_sheet_and_stays() -> None:
+    """Catches biases drawn twice or not at all, and a filter that has not settled when the episode begins."""
+    quiet = InertialSensor(gyro_noise_density=0.0, accelerometer_noise_density=0.0)
+    scenario = make_scenario("ideal").replace(inertial=quiet)
+    env = gymnasium.make_vec(
+        "elastic_env/Testbed-v0", num_envs=256, vectorization_mode="vector_entry_point", num_threads=1,
+        scenario=scenario, observe_link=True, reference="hold",
+    )  # fmt: skip
+    observation, info = env.reset(seed=0)
+    error = observation[:, 6] - info["link_angle"]
+    assert np.sqrt(np.square(error).mean()) == pytest.approx(math.radians(0.25), rel=5 / math.sqrt(2 * 256))
+    for _ in range(100):
+        observation, _, _, _, info = env.step(np.zeros((256, 1), np.float32))
+    np.testing.assert_allclose(observation[:, 6] - info["link_angle"], error, rtol=0.0, atol=1e-6)
+
+
+def test_robots_without_an_imu_on_the_link_refuse_its_scenario() -> None:
+    """Catches a scenario that does nothing on the robot that it is asked of."""
+    ARM.register()
+    with pytest.raises(ConfigurationError, match="about the IMU on a link, which arm does not have"):
+        gymnasium.make(ARM.id, scenario="imu")

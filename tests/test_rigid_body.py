@@ -1,4 +1,4 @@
-"""Pinocchio against MuJoCo: two engines that share no code must agree on the same tree."""
+"""Robots on a fixed base against MuJoCo, robots on a free base by Pinocchio against it: no two of them share code."""
 
 import mujoco
 import numpy as np
@@ -6,7 +6,8 @@ import pytest
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.rigid_body import FloatingBody, RigidBody
+from elastic_env.dynamics.floating_body import FloatingBody
+from elastic_env.dynamics.rigid_body import RigidBody
 from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
 
 PENDULUM = Pendulum()
@@ -162,7 +163,7 @@ def test_leading_axes_are_free(shape: tuple[int, ...]) -> None:
 
 
 def test_results_are_fresh() -> None:
-    """Catches views of Pinocchio's buffers, which the next call overwrites."""
+    """Catches views of buffers, which the next call overwrites."""
     body = RigidBody(rigid_spec(PENDULUM).compile(), [JOINT])
     first = body.gravity_torque(np.array([1.0])), body.gravity_gradient(np.array([1.0]))
     copies = [array.copy() for array in first]

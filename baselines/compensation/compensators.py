@@ -15,7 +15,7 @@ import numpy as np
 from baselines.compensation.contact_torque import LegTorque
 from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
 from elastic_env.core.errors import require_known
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
 from elastic_env.runtime.robot_model import RobotModel
 
@@ -35,18 +35,22 @@ class Motion:
         return Motion(self.q + offset, self.q_dot, self.q_ddot)
 
 
-def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel) -> Array:
-    r"""Eq. 9: θ_cmd − θ_d = K⁻¹ τ_g(θ_d), the offset that brings the link to θ_d.
+def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0) -> Array:
+    r"""Eq. 9, θ_cmd − θ_d = K⁻¹ τ_g(θ_d), and what the servo itself gives way: the offset that brings the link to θ_d.
+
+    .. math:: u - q = \left(K^{-1} + k_p^{-1}\right) \tau_g(q)
 
     Args:
         q_desired: Link angle to reach, θ_d, (..., n) [rad].
         stiffness: K, (n,) [N·m/rad].
         gravity: τ_g of the assumed model.
+        servo_compliance: 1/k_p of servos without an integrator, 0 of servos that hold their angle [rad/(N·m)].
 
     Returns:
         (..., n) [rad].
     """
-    return static_deflection(gravity.gravity_torque(q_desired), stiffness)
+    torque = gravity.gravity_torque(q_desired)
+    return static_deflection(torque, stiffness) + servo_compliance * torque
 
 
 def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> Array:
@@ -131,7 +135,7 @@ class GravityCompensator:
     def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
         require_known("output compensator", [output], get_args(OutputMethod))
         self.model = model
-        self.stiffness = model.stiffness
+        self.stiffness, self._servo_compliance = model.stiffness, model.servo_compliance
         self.gravity = self._load = make_gravity(model, method)
         """τ_g of the desired posture and of the measured one."""
         self._source, self._load_source = self.gravity, make_load(model, output, self.gravity)
@@ -150,11 +154,11 @@ class GravityCompensator:
 
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
         """See `Compensator`."""
-        return input_offset(motion.q, self.stiffness, self.gravity), memory
+        return input_offset(motion.q, self.stiffness, self.gravity, self._servo_compliance), memory
 
     def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
-        """See `Compensator`: all of the offset."""
-        return offset
+        """See `Compensator`: all of the offset but what the servo itself gives way."""
+        return offset / (1.0 + self.stiffness * self._servo_compliance)
 
     def link_angle(self, theta: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
         """See `Compensator`."""

@@ -9,7 +9,6 @@ inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowe
 are not in it. What a motor encoder shows is turned into the link angle by Eq. 10.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -18,10 +17,12 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import get_lapack_funcs
 
+from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.motion.trajectory import minimum_jerk
 
@@ -31,6 +32,8 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
 _MOST_ITERATIONS = 50
+_FILES = (".yaml", ".yml")
+_factored, _solved = get_lapack_funcs(("getrf", "getrs"))  # without the checks of lu_factor, which take longer
 
 
 class PositionCompensator:
@@ -72,12 +75,8 @@ class PositionCompensator:
         self.joints = tuple(_hinges(model) if joints is None else joints)
         held = _held(model, self.joints)
         _require_known_torque(model, held)
-        self._body = RigidBody(model, self.joints, held)
-        self._floating = _floated(model, self.joints, held)
+        self._links = TreeTorque(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
-        self._spring = model.jnt_stiffness[at].copy()
-        self._has_springs = bool(self._spring.any())
-        self._spring_rest = model.qpos_spring[model.jnt_qposadr[at]].copy()
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
         self._highest = np.where(limited, model.jnt_range[at, 1], np.inf)
@@ -94,21 +93,24 @@ class PositionCompensator:
 
     @classmethod
     def from_model(
-        cls, model: str | Path | mujoco.MjSpec | mujoco.MjModel, stiffness: PerJoint, **options: Any
+        cls, model: str | Path | mujoco.MjSpec | mujoco.MjModel, stiffness: PerJoint | str | Path, **options: Any
     ) -> Self:
         """From a file of MJCF or URDF, or from what MuJoCo made of one; further arguments as of the class.
+
+        `stiffness` may be a file, *.yaml, such as the `joints.yaml` of `elastic identify --robot`.
 
         Raises:
             ConfigurationError: The file or a value cannot be used.
         """
-        return cls(compiled_model(model), stiffness, **options)
+        is_file = isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES
+        return cls(compiled_model(model), read_mapping(Path(stiffness)) if is_file else stiffness, **options)  # type: ignore[arg-type]
 
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""
         self._count = 0
         self._load = self._load_wanted = self._load_step = 0.0
         self._carrier, self._place = self._tip, np.zeros(3)
-        self._body.set_load(self._carrier, 0.0, self._place)
+        self._links.set_load(self._carrier, 0.0, self._place)
         self.clipped: BoolArray = np.zeros(len(self.joints), dtype=np.bool_)
 
     def set_payload(self, mass_kg: float, at: npt.ArrayLike = (0.0, 0.0, 0.0), body: str | None = None) -> None:
@@ -135,7 +137,7 @@ class PositionCompensator:
         self._load_wanted, self._load_step = mass, abs(mass - self._load) / self._steps
         if self._ramp == 0.0:
             self._load = mass
-        self._body.set_load(self._carrier, self._load, self._place)
+        self._links.set_load(self._carrier, self._load, self._place)
 
     def torque(
         self, q: npt.ArrayLike, q_dot: npt.ArrayLike | None = None, q_ddot: npt.ArrayLike | None = None
@@ -184,19 +186,19 @@ class PositionCompensator:
             ElasticError: The load overcomes a spring.
         """
         shown_angle = self._checked("theta", theta, "rad")
-        gradient = self._compliance[:, None] * self._gradient(shown_angle)
+        gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
         gradient.flat[:: len(shown_angle) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at θ alone, for speed;
         # the first step is Eq. 12
-        try:
-            inverse = np.linalg.inv(gradient)
-        except np.linalg.LinAlgError:
-            raise self._overcome(shown_angle, np.abs(self._gradient(shown_angle)).max(axis=1)) from None
+        factors, pivots, is_singular = _factored(gradient)
+        if is_singular:
+            raise self._overcome(shown_angle, np.abs(self._links.gravity_gradient(shown_angle)).max(axis=1))
         q, residual = shown_angle, shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
-            q = q - inverse @ residual
-            if np.abs(residual).max() < _LAST_STEP_RAD:
+            step, _ = _solved(factors, pivots, residual)
+            q = q - step
+            if residual.dot(residual) < _LAST_STEP_RAD**2:
                 return q
         raise self._overcome(shown_angle, np.abs(residual))
 
@@ -231,22 +233,9 @@ class PositionCompensator:
 
     def _torque(self, q: Array, q_dot: Array | None, q_ddot: Array | None) -> Array:
         if q_dot is None and q_ddot is None:
-            torque = self._body.gravity_torque(q)
-        else:
-            rest = np.zeros(len(q))
-            torque = self._body.inverse_dynamics(
-                q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot
-            )
-        if self._floating is not None:
-            torque -= self._floating.gravity_torque(q)
-        return torque + self._spring * (q - self._spring_rest) if self._has_springs else torque
-
-    def _gradient(self, q: Array) -> Array:
-        gradient = self._body.gravity_gradient(q)
-        if self._floating is not None:
-            gradient -= self._floating.gravity_gradient(q)
-        gradient.flat[:: len(q) + 1] += self._spring
-        return gradient
+            return self._links.gravity_torque(q)
+        rest = np.zeros(len(q))
+        return self._links.inverse_dynamics(q, rest if q_dot is None else q_dot, rest if q_ddot is None else q_ddot)
 
     def _take_load(self) -> None:
         """One step towards the payload that is wanted."""
@@ -255,7 +244,7 @@ class PositionCompensator:
             self._load = (
                 self._load_wanted if abs(way) <= self._load_step else self._load + np.copysign(self._load_step, way)
             )
-            self._body.set_load(self._carrier, self._load, self._place)
+            self._links.set_load(self._carrier, self._load, self._place)
 
 
 def _hinges(model: mujoco.MjModel) -> list[str]:
@@ -304,15 +293,6 @@ def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> N
             )
     if model.tendon_stiffness.any() or model.tendon_stiffnesspoly.any():
         raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
-
-
-def _floated(model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, float]) -> RigidBody | None:
-    """The weight that `gravcomp` of the bodies carries, as a robot of its own; None where there is none."""
-    if not model.body_gravcomp.any():
-        return None
-    carried = copy.copy(model)
-    carried.body_mass[:] = model.body_mass * model.body_gravcomp
-    return RigidBody(carried, joints, held)
 
 
 def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:

@@ -134,15 +134,7 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
         ConfigurationError: The file is missing, is not a YAML mapping, or does not fit the model.
     """
     file = Path(path)
-    try:
-        content = parse_yaml(_text_of(file))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
-    if content is None and changes:
-        content = {}
-    if not isinstance(content, dict):
-        got = "an empty file" if content is None else type(content).__name__
-        raise ConfigurationError(f"{file} must hold a mapping of parameters, such as 'name: value', got {got}")
+    content = read_mapping(file, empty=bool(changes))
     try:
         return model(**{**content, **(changes or {})})
     except ModelError as error:
@@ -175,6 +167,28 @@ def load_json(path: Path, model: type[ModelT], what: str, missing: Callable[[str
         return model(**content)
     except ModelError as error:
         raise ConfigurationError(f"{path} describes no {what}: {error.named()}") from None
+
+
+def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
+    """The mapping that a file of YAML holds.
+
+    Args:
+        file: It.
+        empty: Whether an empty file is taken, as an empty mapping.
+
+    Raises:
+        ConfigurationError: The file cannot be read, is no YAML, or holds something else.
+    """
+    try:
+        content = parse_yaml(_text_of(file))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
+    if content is None and empty:
+        content = {}
+    if not isinstance(content, dict):
+        got = "an empty file" if content is None else type(content).__name__
+        raise ConfigurationError(f"{file} must hold a mapping of parameters, such as 'name: value', got {got}")
+    return content
 
 
 def _text_of(file: Path) -> str:

@@ -27,7 +27,7 @@ class Servo(Model):
     r"""Position servo on the rotor: PID on the motor encoder, limited in torque.
 
     .. math::
-        \tau_m = \mathrm{clip}(k_p (u - \theta) - k_v \dot\theta + k_i \textstyle\int (u - \theta) dt, \pm \tau_{max})
+        \tau_m = \mathrm{clip}(k_p (u - \theta) - k_v \dot\theta + k_i \int (u - \theta) dt, \pm \tau_{max})
 
     A cascade of a position P loop and a velocity PI loop, as position servos have it, acts like this PID. The
     integrator lets it hold its angle without steady-state error. Against wind-up it is clamped to what it can be

@@ -11,9 +11,9 @@ from scipy import linalg
 
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.biped import Biped
+from elastic_env.dynamics.floating_body import FloatingBody
 from elastic_env.dynamics.leg_chains import LegLoads
 from elastic_env.dynamics.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
-from elastic_env.dynamics.rigid_body import FloatingBody
 
 _DOF = 6
 _STEP = 1e-4  # of the finite differences [m], [rad]

@@ -19,7 +19,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.joint.make_elastic import transformed
 from elastic_env.motion.references import AnyReference, make_reference
@@ -36,6 +36,8 @@ _ENLARGED = 8.0
 """Factor by which a picture enlarges deviations from the reference."""
 _REFERENCE, _REFERENCE_RGBA = "elastic_env_reference_", (0.35, 0.65, 0.45, 0.35)
 """Prefix and colour of the robot that is the reference."""
+_RIGID_NM_PER_RAD = 1e15
+"""Stiffness of a joint without a spring beside servos that give way."""
 
 
 class JointRobotConfig(JointConfig):
@@ -127,7 +129,7 @@ class JointRobot:
         known, built = self.rigid(), _loaded(self.rigid(), self._load_body(), config.scenario.pendulum_mass_scale)
         period = config.control_period_s
         true = RobotModel(true_joints, built.copy().compile(), period)
-        body = RigidBody(true.rigid, list(true_joints))
+        body = TreeTorque(true.rigid, list(true_joints))
         home = np.zeros(len(true_joints)) if self.home is None else np.array(self.home, dtype=np.float64)
         if home.shape != (len(true_joints),):
             raise ConfigurationError(f"home must have one angle per joint, {len(true_joints)}, got {len(home)}")
@@ -142,7 +144,8 @@ class JointRobot:
             add_accelerometer(spec, self.imu)
         return JointPlant(
             name=self.name, model=spec.compile(), assumed=RobotModel(config.joints, known.compile(), period), true=true,
-            static_torque=body.gravity_torque, rest_angle=partial(_rest_angle, true=true, body=body), home=home,
+            static_torque=body.gravity_torque, home=home,
+            rest_angle=partial(_rest_angle, stiffness=true.rest_stiffness(config.form), true=true, body=body),
         )  # fmt: skip
 
     def _load_body(self) -> str:
@@ -204,7 +207,7 @@ def _loaded(spec: mujoco.MjSpec, body: str, scale: float) -> mujoco.MjSpec:
     return spec
 
 
-def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: RigidBody, home: Array) -> None:
+def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: TreeTorque, home: Array) -> None:
     """Refuse a reference that the servos cannot follow, by a plan of it."""
     plan = config.reference.plan(np.random.default_rng(0), config.control_period_s)
     rows = slice(None, None, max(plan.num_steps // 500, 1))
@@ -215,7 +218,10 @@ def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: RigidBo
     require_torque(config.reference, np.abs(motion).max(axis=0) + friction, limits)
 
 
-def _rest_angle(theta: Array, true: RobotModel, body: RigidBody) -> Array:
+def _rest_angle(command: Array, stiffness: Array, true: RobotModel, body: TreeTorque) -> Array:
     """Link angles at rest without friction: a dead band is crossed to the side to which the load pulls."""
-    engaged = theta - np.sign(body.gravity_torque(theta)) * true.backlash / 2.0
-    return static_link_angle(engaged, true.stiffness, body.gravity_torque, body.gravity_gradient)
+    if np.isinf(stiffness).all():
+        return command
+    engaged = command - np.sign(body.gravity_torque(command)) * true.backlash / 2.0
+    finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
+    return static_link_angle(engaged, finite, body.gravity_torque, body.gravity_gradient)

@@ -27,7 +27,7 @@ from elastic_env.runtime.joint_config import JointConfig
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.runtime.robot_model import RobotModel
-from elastic_env.runtime.sensors import NoiseStream, attitude, is_due, quantise
+from elastic_env.runtime.sensors import NoiseStream, PendulumImu, attitude, is_due, quantise
 from elastic_env.runtime.task import Outcome
 
 ACTION_BOUND_RAD = 0.3
@@ -72,8 +72,10 @@ class JointPlant:
         model: Compiled, with elastic joints.
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
-        rest_angle: Link angles at rest without friction, from motor angles, (..., n) [rad].
+        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad].
         home: Added to the reference of each joint, (n,) [rad].
+        imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
+            q = 0 [m]; None where there is no such IMU.
     """
 
     name: str
@@ -83,6 +85,7 @@ class JointPlant:
     static_torque: Callable[[Array], Array]
     rest_angle: Callable[[Array], Array]
     home: Array
+    imu_arm_m: float | None = None
 
     @property
     def joint_names(self) -> list[str]:
@@ -213,7 +216,7 @@ class JointTask(Stateful):
 
     STATE = (
         "_reference", "_noise", "_sensors", "_step", "_present", "_coming", "_state", "_measured", "_shown",
-        "_encoder_bias", "_imu_bias", "_offset", "_offset_before", "_command", "_diverged", "_force",
+        "_encoder_bias", "_imu_bias", "_imu", "_offset", "_offset_before", "_command", "_diverged", "_force",
     )  # fmt: skip
 
     failure_names: tuple[str, ...] = ()  # what stands on a fixed base cannot fall over
@@ -244,7 +247,7 @@ class JointTask(Stateful):
         servos = [self.model.actuator(servo_name(joint)) for joint in joints]
         self._inputs = np.array([servo.id for servo in servos])
         self._integrators = np.array([servo.actadr[0] for servo in servos])
-        self._noise = NoiseStream(num_worlds, NOISE)
+        self._noise, self._imu = NoiseStream(num_worlds, NOISE), _inertial_imu(config, plant, num_worlds)
         self._reference = PlanTable(config.reference, config.control_period_s, num_worlds, plant.home)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._present = self._coming = self._reference.at(self._step)
@@ -268,6 +271,8 @@ class JointTask(Stateful):
             self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
             self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
             self._noise.restart(world, draws[world].noise())
+            if self._imu is not None:
+                self._imu_bias[world] += self._imu.draw(world, generator, draws[world].noise())
         self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
         self._follow()
         self._offset[worlds] = self._offset_before[worlds] = 0.0
@@ -276,6 +281,8 @@ class JointTask(Stateful):
             simulation.bind("sensordata")
         self._place(simulation, worlds)
         self._read(simulation, worlds)
+        if self._imu is not None:
+            self._imu.settle(worlds, self._state.q[:, 0])
         fresh = self._measure(worlds)
         at_rest = Measurement(fresh.encoder, fresh.encoder, fresh.imu)
         self._measured = self._measured.with_worlds(worlds, at_rest)
@@ -300,6 +307,8 @@ class JointTask(Stateful):
         self._step, self._diverged = self._step + 1, diverged
         self._present, self._coming = self._coming, self._reference.at(self._step + 1)
         self._read(simulation, ~diverged)
+        if self._imu is not None:
+            self._imu.advance(~diverged, self._state.q[:, 0], self._state.q_dot[:, 0])
         before, self._measured = self._measured, self._measure(~diverged)
         self._shown = before if self.config.scenario.delay_steps else self._measured
         if self._sensors:
@@ -399,12 +408,13 @@ class JointTask(Stateful):
         return joint_torque(deflection, deflection_rate, model.stiffness, model.damping, model.backlash)
 
     def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
-        theta = (self._command - self._encoder_bias)[worlds]
-        q = theta if self.config.form == "rigid" else self._plant.rest_angle(theta)
+        command = (self._command - self._encoder_bias)[worlds]
+        q = self._plant.rest_angle(command)
+        torque = self._plant.static_torque(q)
+        theta = command - self._true_model.servo_compliance * torque
         simulation.qpos[np.ix_(worlds, self._at.theta)] = theta
         simulation.qpos[np.ix_(worlds, self._at.q)] = q
-        simulation.ctrl[np.ix_(worlds, self._inputs)] = theta
-        torque = self._plant.static_torque(q)
+        simulation.ctrl[np.ix_(worlds, self._inputs)] = command
         for column, servo in enumerate(self._true_model.servos):
             if servo.integral_gain > 0.0:
                 simulation.act[worlds, self._integrators[column]] = torque[:, column] / servo.integral_gain
@@ -429,10 +439,34 @@ class JointTask(Stateful):
         scenario, last = self.config.scenario, self._measured
         counts = self._true_model.encoder_counts_per_turn if scenario.encoder_counts else None
         due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
-        noise = self._noise.next(due)["imu"][:, None]
         fresh = Measurement(
             encoder=quantise(self._state.theta + self._encoder_bias, counts),
             encoder_before=last.encoder,
-            imu=np.where(due[:, None], attitude(scenario.imu, self._state.q, self._imu_bias, noise), last.imu),
+            imu=np.where(due[:, None], self._link_angle(due), last.imu),
         )
         return fresh if worlds.all() else last.with_worlds(worlds, fresh)
+
+    def _link_angle(self, due: BoolArray) -> Array:
+        """What the IMUs of worlds whose next sample is due show of the links, (num_worlds, n) [rad]."""
+        noise, imu = self._noise.next(due)["imu"][:, None], self.config.scenario.imu
+        if self._imu is None:
+            return attitude(imu, self._state.q, self._imu_bias, noise)
+        return attitude(imu, self._imu.angle[:, None], self._imu_bias, np.zeros_like(noise))
+
+
+def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> PendulumImu | None:
+    """The IMU that computes its attitude, in scenarios that have one.
+
+    Raises:
+        ConfigurationError: The robot has no place for it.
+    """
+    sensor = config.scenario.inertial
+    if sensor is None:
+        return None
+    if plant.imu_arm_m is None:
+        raise ConfigurationError(
+            f"scenario {config.scenario.name!r} is about the IMU on a link, which {plant.name} does not have; "
+            "choose another one, or the testbed or the walker"
+        )
+    gravity = float(np.linalg.norm(plant.model.opt.gravity))
+    return PendulumImu(sensor, plant.imu_arm_m, gravity, config.control_period_s, num_worlds)

@@ -85,6 +85,19 @@ class RobotModel:
             raise ConfigurationError(f"a servo is needed on every joint, but there is none on: {', '.join(without)}")
         return tuple(joint.servo for joint in self.joints.values() if joint.servo is not None)
 
+    @property
+    def servo_compliance(self) -> Array:
+        """How far a servo itself gives way under a torque, (n,) [rad/(N·m)]: 1/k_p, 0 where an integrator holds it."""
+        servos = [joint.servo for joint in self.joints.values()]
+        return np.array([0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos])
+
+    def rest_stiffness(self, form: str) -> Array:
+        """Spring and servo in series, as a command at rest feels them, (n,) [N·m/rad]; infinite for what is rigid."""
+        springs = np.zeros(len(self.joints)) if form == "rigid" else 1.0 / self.stiffness
+        with np.errstate(divide="ignore"):
+            in_series = 1.0 / (springs + self.servo_compliance)
+        return np.where(self.servo_compliance > 0.0, in_series, np.inf if form == "rigid" else self.stiffness)
+
     def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
         """The same robot with another stiffness, one number for all joints or one per joint [N·m/rad].
 

@@ -44,8 +44,8 @@ class Scenario(Model):
     pelvis_imu: AttitudeSensor = AttitudeSensor(rate_hz=500.0)
     """IMU in the pelvis of the walker, the same for roll and pitch."""
     inertial: InertialSensor | None = None
-    """walker: IMU in the pelvis that computes its attitude; None for one that shows the true one with `pelvis_imu`'s
-    noise. Other errors of `pelvis_imu` are then those of the mounting."""
+    """IMU in the walker's pelvis or on the testbed's link that computes its attitude; None for one that shows the true
+    one with the noise of `pelvis_imu` or `imu`. Other errors of these are then those of the mounting."""
     gyro_noise_rad_s: float = quantity("rad/s", 0.0, ge=0, description="walker: standard deviation of the gyroscope")
     force_noise_n: float = quantity("N", 0.0, ge=0, description="walker: standard deviation of the foot forces")
     moment_noise_nm: float = quantity("N·m", 0.0, ge=0, description="walker: standard deviation of the foot moments")
@@ -197,7 +197,7 @@ DISTRIBUTIONS: dict[str, ScenarioChange] = {
 quantity beyond these."""
 
 
-WALKER_FIELDS = ("stiffness_spread", "inertial", "push_n", "slope_rad", "ranges")
+WALKER_FIELDS = ("stiffness_spread", "push_n", "slope_rad", "ranges")
 """Parameters that only a robot that walks knows."""
 WALKER_ONLY = tuple(name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS})
 """Changes that set one of them."""

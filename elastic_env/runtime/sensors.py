@@ -1,7 +1,8 @@
 """What a robot measures: motor encoders with counts, an attitude sensor with noise, bias and a rate of its own.
 
 An `AttitudeSensor` shows the true attitude with errors. An `InertialSensor` computes it from a gyroscope and an
-accelerometer, as a device does, so that the acceleration of what carries it disturbs it.
+accelerometer, as a device does, so that the acceleration of what carries it disturbs it. `PendulumImu` plays one on a
+link that hangs from a horizontal axis.
 """
 
 import math
@@ -13,7 +14,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.core.state import Stateful
-from elastic_env.dynamics.walk_kernels import in_whole_counts, shown_angle
+from elastic_env.dynamics.walk_kernels import complementary_filter, in_whole_counts, settled_vertical, shown_angle
 
 
 class AttitudeSensor(Model):
@@ -194,3 +195,75 @@ class NoiseStream(Stateful):
         drawn = self._generators[world].standard_normal((len(self._samples), kind.itemsize // 8))
         self._samples[:, world] = drawn.view(kind)[:, 0]
         self._used[world] = 0
+
+
+_PENDULUM_NOISE = np.dtype([("rate", np.float64), ("force", np.float64, (2,))])
+"""A sample of noise: of the gyroscope, and of the accelerometer along both axes in the plane of the motion [1]."""
+
+
+class PendulumImu(Stateful):
+    r"""An `InertialSensor` on a link that hangs from a horizontal axis where q = 0, and turns with it.
+
+    In the frame of the link, x along its motion and z towards the axis, the vertical is (sin q, 0, cos q). The specific
+    force at a distance r from the axis is
+
+    .. math:: f = (r \ddot q + g \sin q, \; 0, \; r \dot q^2 + g \cos q)
+
+    The gyroscope shows the mean rate over a control period, the accelerometer the mean tangential acceleration.
+
+    Args:
+        sensor: Its errors and its filter.
+        arm_m: r [m].
+        gravity_m_s2: g [m/s²].
+        period_s: Control period [s].
+        num_worlds: How many.
+    """
+
+    STATE = ("_up", "_last", "_bias", "_noise")
+
+    def __init__(
+        self, sensor: InertialSensor, arm_m: float, gravity_m_s2: float, period_s: float, num_worlds: int
+    ) -> None:
+        self._sensor, self._arm_m, self._gravity, self._period_s = sensor, arm_m, gravity_m_s2, period_s
+        self._gain = 1.0 - math.exp(-period_s / sensor.time_constant_s)
+        self._up, self._last = np.zeros((num_worlds, 3)), np.zeros((num_worlds, 2))
+        self._bias = np.zeros((num_worlds, 3))  # of the gyroscope, then of the accelerometer along x and z
+        self._noise = NoiseStream(num_worlds, _PENDULUM_NOISE)
+
+    def draw(self, world: int, generator: np.random.Generator, noise: np.random.Generator) -> float:
+        """Draw the errors of an episode; the offset of the angle that is shown is for the caller [rad]."""
+        sensor = self._sensor
+        gyro, x, z, offset = generator.standard_normal(4)
+        force = sensor.accelerometer_bias_m_s2
+        self._bias[world] = sensor.gyro_bias_rad_s * gyro, force * x, force * z
+        self._noise.restart(world, noise)
+        return float(sensor.offset_rad * offset)
+
+    def settle(self, worlds: BoolArray, q: Array) -> None:
+        """The links of some worlds have been at rest at q, (num_worlds,) [rad], for long."""
+        self._last[worlds] = np.stack([q, np.zeros_like(q)], axis=1)[worlds]
+        for world in np.flatnonzero(worlds):
+            force = self._force(q, np.zeros_like(q), np.zeros_like(q))[world]
+            gyro = np.array([0.0, -self._bias[world, 0], 0.0])
+            settled_vertical(self._up[world], force, gyro, self._sensor.time_constant_s)
+
+    def advance(self, worlds: BoolArray, q: Array, q_dot: Array) -> None:
+        """The links of some worlds have moved to q, (num_worlds,) [rad], with rates q̇ [rad/s], in a control period."""
+        drawn, last, sensor = self._noise.next(worlds), self._last, self._sensor
+        force = self._force(q, q_dot, (q_dot - last[:, 1]) / self._period_s)
+        force[:, ::2] += sensor.accelerometer_noise_rad * self._gravity * drawn["force"]
+        turned = q - last[:, 0] + self._period_s * (self._bias[:, 0] + sensor.gyro_noise_rad_s * drawn["rate"])
+        for world in np.flatnonzero(worlds):
+            complementary_filter(self._up[world], np.array([0.0, -turned[world], 0.0]), force[world], self._gain)
+        self._last[worlds] = np.stack([q, q_dot], axis=1)[worlds]
+
+    @property
+    def angle(self) -> Array:
+        """Link angle by the filter, (num_worlds,) [rad]."""
+        return np.arctan2(self._up[:, 0], self._up[:, 2])
+
+    def _force(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:
+        """Specific force with its bias in the frame of the link, (num_worlds, 3) [m/s²]."""
+        r, g, bias = self._arm_m, self._gravity, self._bias
+        tangential, radial = r * q_ddot + g * np.sin(q), r * np.square(q_dot) + g * np.cos(q)
+        return np.stack([tangential + bias[:, 1], np.zeros_like(q), radial + bias[:, 2]], axis=1)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from rich.console import Console
@@ -44,6 +44,46 @@ class OnHardware:
         from train.hardware.session import hardware_arguments
 
         return hardware_arguments(self.port, self.imu_port, self.mounting, yes=self.yes, patient=self.patient)
+
+
+@dataclass
+class OfArm:
+    """Options of `elastic identify` for an arm of which there is a log of static poses."""
+
+    robot: Path | None = None
+    """Rigid model of an arm, MJCF or URDF, in place of the testbed."""
+    log: Path | None = None
+    """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an IMU or joint torques."""
+    joints: tuple[str, ...] = ()
+    """Names or patterns of the joints whose stiffness is sought; default all in the log. The others are rigid."""
+    end_effector: str | None = None
+    """Site or body whose position is measured or that carries the IMU; default the outermost body."""
+    payload: str | None = None
+    """Body or site that carries a payload of unknown mass, which is estimated too."""
+    frame: Literal["known", "offset", "pose"] = "offset"
+    """Frame of tracker or IMU: known, unknown by an offset, or in pose; for an IMU the last two mean its mounting."""
+    measured_by: Literal["link_encoders", "end_effector", "imu", "torques"] | None = None
+    """Measurement to use, where the log has several or there is no log."""
+    within: float = 0.03
+    """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this share."""
+    assume: float | None = None
+    """K [N·m/rad] to write for joints that the poses do not tell; default the largest that was identified."""
+    plan: int = 0
+    """Propose so many further poses, within limits and without contacts, that tell the stiffness best."""
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Options for an arm; empty where none is given.
+
+        Raises:
+            ConfigurationError: The robot is missing.
+        """
+        if self == OfArm():
+            return {}
+        if self.robot is None:
+            raise ConfigurationError("--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)")
+        paths = {"robot": str(self.robot), "log": None if self.log is None else str(self.log)}
+        return {**vars(self), **paths}
 
 
 def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from elastic_env.core.errors import ConfigurationError
 from train.commands.options import (
     CONSOLE,
     DEFAULT_SCENARIO,
+    OfArm,
     OnHardware,
     motion,
     options_named,
@@ -29,6 +30,9 @@ class Identify:
     K, and a figure. Example: elastic identify --scenario backlash
 
     On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
+
+    An arm from a log of static poses, with joints.yaml for compensator and environment, see docs/identification.md:
+    elastic identify --robot arm.urdf --log poses.csv --end-effector tool0 --plan 20
     """
 
     scenario: str | None = None
@@ -46,16 +50,35 @@ class Identify:
     output: Path | None = None
     """Folder for the results, new or empty; default runs/identify, numbered if taken."""
     on: OnHardware = field(default_factory=OnHardware)
+    arm: OfArm = field(default_factory=OfArm)
 
     def run(self) -> None:
         """Identify, write, print."""
+        if self.arm.given:
+            self._run_arm()
+            return
         from train.experiments.identify import IdentifyConfig, run_identification
 
         arguments = self.on.arguments
         with options_named():
-            given = {name: value for name, value in vars(self).items() if name not in ("output", "on", "scenario")}
+            others = ("output", "on", "scenario", "arm")
+            given = {name: value for name, value in vars(self).items() if name not in others}
             config = IdentifyConfig(**given, scenario=scenario_played(self.scenario, arguments), hardware=arguments)
         run_identification(config, CONSOLE, self.output)
+
+    def _run_arm(self) -> None:
+        """Identify an arm from a log."""
+        from train.experiments.identify_arm import IdentifyArmConfig, run_arm_identification
+
+        of_testbed = Identify(seed=self.seed, output=self.output, arm=self.arm)
+        if others := [name for name, value in vars(self).items() if value != getattr(of_testbed, name)]:
+            names = ", ".join(
+                "--port and the like" if name == "on" else f"--{name.replace('_', '-')}" for name in others
+            )
+            raise ConfigurationError(f"options of the testbed: {names}; leave them out beside --robot and --log")
+        with options_named():
+            config = IdentifyArmConfig(**self.arm.given, seed=self.seed)
+        run_arm_identification(config, CONSOLE, self.output)
 
 
 @dataclass

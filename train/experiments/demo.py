@@ -17,6 +17,7 @@ from train.experiments.compare import CompareConfig
 from train.figures import plots
 from train.figures.figures import cells, draw_figure
 from train.figures.testbed_plots import draw_identification, draw_static_errors, draw_time_series, static_errors
+from train.report.pages import PAPER_PELVIS
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import run_folder
 
@@ -55,8 +56,6 @@ _SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its b
         PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
     ],
 )
-_PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
-"""Angle error of the pelvis in the paper, in both gaits [mrad]."""
 
 
 def demo(console: Console, output: Path | None = None) -> None:
@@ -119,7 +118,7 @@ def _walk_table(walks: Sequence[Evaluation]) -> Table:
         is_paper = condition.scenario == "nominal"
         where = condition.environment.title(condition.reference_name) + ("" if is_paper else f", {condition.scenario}")
         name = f"{where}, {condition.policy.title} [mrad]"
-        paper = _PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
+        paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
         table.add_row(escape(name), "fell" if walk.num_failed else _pelvis_peaks(walk), paper)
     return table
 

@@ -167,11 +167,12 @@ def paired_rows(found: Sequence[Standing]) -> tuple[list[str], list[list[str]]]:
     rows = []
     for s in found:
         if s.is_column and s.training_seeds:
-            rows.append([s.policy, f"{s.scope}, {s.reference}", s.title, _said(s.base), _said(s.rival)])
+            rows.append([s.policy, f"{s.scope}, {s.reference}", s.title, said(s.base), said(s.rival)])
     return ["residual", "where", "metric", "against its base", f"against the {BEST_ANALYTIC}"], rows
 
 
-def _said(paired: Paired | None) -> str:
+def said(paired: Paired | None) -> str:
+    """A paired change in words: the change, its interval, a star where nothing is shown, and whom it compares with."""
     if paired is None:
         return "-"
     star = "" if paired.verdict in ("lower", "higher") or not math.isfinite(paired.change.value) else " *"
@@ -179,10 +180,11 @@ def _said(paired: Paired | None) -> str:
 
 
 LEGEND = (
-    "Lower is better. Each cell is a mean over the scenarios of means over the episodes that did not fail; bold is the "
-    "best of its track. Of a residual it is the interquartile mean over training seeds, with the 95 % interval below. "
-    "✕ counts the episodes that failed, such as by a fall: who fails less often is the better one. µs: processor time "
-    "of the policy alone for a control step of one world on one thread, median of one interleaved run."
+    "Lower is better. Each cell is a mean over scenarios of means over the episodes that did not fail. Bold is the "
+    "best of its track. A residual has the interquartile mean over training seeds, with the 95 % interval below. ✕ "
+    "counts episodes that failed, such as by a fall. A policy that fails less often ranks first. The column µs is the "
+    "processor time of the policy alone for a control step of one world on one thread. It is a median of one "
+    "interleaved run."
 )
 PAIRED = (
     "Paired changes on the same episodes: interquartile mean over training seeds with its 95 % interval. Below zero, "

@@ -9,7 +9,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.robots.testbed import NAME
-from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
+from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, imu_arm, rigid_spec
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.joint_config import JointConfig, require_torque
 from elastic_env.runtime.joint_task import JointPlant
@@ -48,10 +48,13 @@ def plant(config: TestbedConfig) -> JointPlant:
     spec = elastic_spec(pendulum, joint, config.form, config.timestep_s)
     if ACCELEROMETER in config.sensors:
         add_accelerometer(spec, "imu")
+    true = robot_model(joint, pendulum)
+    stiffness = true.rest_stiffness(config.form)
     return JointPlant(
         name=NAME, model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
-        true=robot_model(joint, pendulum), static_torque=pendulum.torque,
-        rest_angle=partial(_rest_angle, joint=joint, pendulum=pendulum), home=np.zeros(1),
+        true=true, static_torque=pendulum.torque,
+        rest_angle=partial(_rest_angle, stiffness=stiffness, joint=joint, pendulum=pendulum), home=np.zeros(1),
+        imu_arm_m=imu_arm(pendulum),
     )  # fmt: skip
 
 
@@ -74,8 +77,10 @@ def require_feasible(config: TestbedConfig) -> None:
     require_torque(config.reference, np.array([needed]), np.array([joint.servo.torque_limit]))
 
 
-def _rest_angle(theta: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
+def _rest_angle(theta: Array, stiffness: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
     """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
+    if np.isinf(stiffness).all():
+        return theta
     half = np.sign(theta) * joint.backlash / 2.0
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
-    return static_link_angle(engaged, joint.stiffness, pendulum.torque, pendulum.torque_gradient)
+    return static_link_angle(engaged, stiffness, pendulum.torque, pendulum.torque_gradient)

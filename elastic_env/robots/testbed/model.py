@@ -48,6 +48,11 @@ class Pendulum(Model):
         return self.replace(mass=self.mass * scale, gravity_torque=self.gravity_torque * scale)
 
 
+def imu_arm(pendulum: Pendulum) -> float:
+    """Distance of the IMU from the joint axis, half way to the center of mass [m]."""
+    return 0.5 * pendulum.com_distance
+
+
 def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> mujoco.MjSpec:
     """The testbed with a rigid joint and no actuator; every inertia is explicit, no geom collides.
 
@@ -71,7 +76,7 @@ def rigid_spec(pendulum: Pendulum, gravity: float = GRAVITY_M_S2) -> mujoco.MjSp
     )
     # the axis points to −y, so that positive q carries the pendulum towards +x
     link.add_joint(name=JOINT, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, -1.0, 0.0])
-    link.add_site(name="imu", pos=[0.0, 0.0, -0.5 * pendulum.com_distance])
+    link.add_site(name="imu", pos=[0.0, 0.0, -imu_arm(pendulum)])
     return spec
 
 

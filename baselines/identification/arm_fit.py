@@ -1,0 +1,216 @@
+r"""Stiffness of every joint of an arm from static poses: least squares over all poses, with 95 % intervals.
+
+The unknowns x of `PoseModel` minimise the squared residuals of the measurement. A weak prior, Gaussian with the scales
+of the model, keeps unknowns near zero that the poses say nothing about; on the others it has no visible effect.
+
+The intervals do not assume equal noise: friction without known direction acts on all measurements of a pose at once,
+and more in one pose than in another. The covariance of x is the cluster-robust one in its jackknife form (CR3), a
+cluster per pose, with Student's t:
+
+.. math:: V = M^{-1} \Big( \tfrac{N-1}{N} \sum_i J_i^T e^*_i e^{*T}_i J_i + \Lambda \Big) M^{-1}, \quad
+    e^*_i = (1 - J_i M^{-1} J_i^T)^{-1} e_i, \quad M = J^T J + \Lambda
+
+(R. M. Bell and D. F. McCaffrey, "Bias Reduction in Standard Errors for Linear Regression with Multi-Stage Samples",
+Survey Methodology 28(2), 2002.) Λ is the precision of the prior.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.optimize import least_squares
+
+from baselines.identification.pose_log import Kind
+from baselines.identification.pose_model import PoseModel, measurement_unit
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array, IntArray
+
+_FINEST: dict[Kind, float] = {"end_effector": 1e-4, "imu": 1e-4, "link_encoders": 1e-5, "torques": 1e-2}
+"""Noise beside which the prior counts [m], [rad], [N·m]: about that of good sensors."""
+MOST_EVALUATIONS = 100
+"""Steps after which a fit gives up."""
+USUAL_EVALUATIONS = 12
+"""Steps of a usual fit, at most."""
+
+_FURTHER_POSES = 3  # beyond those that are as many numbers as unknowns
+_FIRST_DEFLECTION_RAD = 0.01  # not zero: a rigid joint shows nothing of its friction
+_UNLIKE = 3.0  # ratio of how far positions spread, measured and of the model
+_OUTLYING = 5.0  # standard deviations
+
+
+@dataclass(frozen=True)
+class ArmFit:
+    """Unknowns that fit a log, and how well they are known.
+
+    Attributes:
+        model: The poses.
+        unknowns: Estimates, (p,).
+        covariance: Of the estimates, (p, p).
+        information: JᵀJ / σ² + Λ in units of the scales, with the spread σ of the residuals, (p, p).
+        q: Link angles, (N, n) [rad].
+        residual: Measured less predicted, (N, m).
+        spread: Standard deviation of the residuals, in the unit of the measurement.
+        freedom: Degrees of freedom of the intervals.
+    """
+
+    model: PoseModel
+    unknowns: Array
+    covariance: Array
+    information: Array
+    q: Array
+    residual: Array
+    spread: float
+    freedom: int
+
+    @property
+    def quantile(self) -> float:
+        """Half-width of a 95 % interval in standard deviations."""
+        return float(stats.t.ppf(0.975, self.freedom))
+
+    def estimate(self, name: str) -> tuple[Array, Array]:
+        """Estimates of one kind of unknown and the half-widths of their 95 % intervals."""
+        own = self.model.unknowns.slices[name]
+        return self.unknowns[own], self.quantile * np.sqrt(np.diag(self.covariance)[own])
+
+    @property
+    def outliers(self) -> IntArray:
+        """Poses whose residual is far beyond the spread."""
+        size = np.sqrt(np.mean(self.residual**2, axis=1))
+        usual = 1.4826 * np.median(size) if len(size) else 0.0
+        return np.flatnonzero(size > _OUTLYING * max(float(usual), 1e-12))
+
+
+def fit_arm(model: PoseModel, progress: Callable[[int], None] | None = None) -> ArmFit:
+    """Fit the unknowns of a log.
+
+    Args:
+        model: The poses.
+        progress: Called with the number of evaluations so far.
+
+    Raises:
+        ConfigurationError: Too few poses for the unknowns.
+        ElasticError: The log does not fit the arm.
+    """
+    require_poses(model)
+    finest = _FINEST[model.log.kind]
+    problem = _Problem(model, finest, progress)
+    start = model.start_with(_FIRST_DEFLECTION_RAD) / model.scale
+    found = least_squares(problem.residual, start, jac=problem.jacobian, method="trf", max_nfev=MOST_EVALUATIONS)  # type: ignore[arg-type]
+    if not found.success:
+        raise ElasticError(
+            f"the fit did not converge in {MOST_EVALUATIONS} steps; check signs, zeros and units of the log's columns"
+        )
+    return _described(model, model.scale * found.x, finest)
+
+
+class _Problem:
+    """Residuals of the poses and of the prior, and their derivatives, in units of noise and of the scales.
+
+    Args:
+        model: The poses.
+        noise: Noise of a measurement, in its unit.
+        progress: Called with the number of evaluations so far.
+    """
+
+    def __init__(self, model: PoseModel, noise: float, progress: Callable[[int], None] | None) -> None:
+        self._model, self._noise, self._progress = model, noise, progress
+        self._count, self._at, self._gradient = 0, np.empty(0), np.empty(0)
+
+    def residual(self, x: Array) -> Array:
+        """Predicted less measured, then the prior, (N m + p,)."""
+        self._count += 1
+        if self._progress is not None:
+            self._progress(self._count)
+        predicted, self._gradient = self._model.predicted(self._model.scale * x)
+        self._at = x.copy()
+        return np.concatenate([(predicted - self._model.target).ravel() / self._noise, x])
+
+    def jacobian(self, x: Array) -> Array:
+        """Its derivatives, (N m + p, p); `least_squares` asks for them where it has asked for the residual."""
+        if not np.array_equal(x, self._at):
+            self.residual(x)
+        rows = self._gradient.reshape(-1, len(x)) * self._model.scale / self._noise
+        return np.concatenate([rows, np.eye(len(x))])
+
+
+def require_poses(model: PoseModel) -> None:
+    """Refuse logs with fewer numbers than unknowns, and positions of another unit.
+
+    Raises:
+        ConfigurationError: Too few poses, or positions that the arm cannot reach.
+    """
+    size, each = model.unknowns.size, model.target.shape[1]
+    needed = -(-size // each) + _FURTHER_POSES
+    if len(model.log) < needed:
+        raise ConfigurationError(
+            f"{size} unknowns need at least {needed} poses of {each} measured numbers each, the log has "
+            f"{len(model.log)}; log further poses, or seek fewer joints by --joints"
+        )
+    if model.log.kind == "end_effector":
+        _require_reach(model)
+
+
+def _require_reach(model: PoseModel) -> None:
+    """Refuse positions that spread far more or less than those of the model, such as millimetres."""
+    own, measured = (_radius(points) for points in (model.arm.attitude(model.log.theta).position, model.log.measured))
+    if not own / _UNLIKE < measured < own * _UNLIKE:
+        raise ConfigurationError(
+            f"the columns end_effector spread over {measured:.3g} m, {model.arm.end_effector!r} of the model over "
+            f"{own:.3g} m: convert millimetres to metres, or name the body that was measured by --end-effector"
+        )
+
+
+def _radius(points: Array) -> float:
+    """Root mean square distance from the mean, which does not depend on the frame [m]."""
+    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))
+
+
+def information_of(model: PoseModel, unknowns: Array, spread: float) -> tuple[Array, Array]:
+    """Scaled derivatives of a unit of noise, (N, m, p), and JᵀJ + Λ of them, (p, p)."""
+    _, gradient = model.predicted(unknowns)
+    rows = gradient * model.scale / spread
+    return rows, np.tensordot(rows, rows, axes=([0, 1], [0, 1])) + np.eye(len(unknowns))
+
+
+def _described(model: PoseModel, unknowns: Array, finest: float) -> ArmFit:
+    """Spread and covariance at the estimates."""
+    predicted, _ = model.predicted(unknowns)
+    residual = model.target - predicted
+    rows, information = information_of(model, unknowns, finest)
+    inverse = np.linalg.inv(information)
+    used = float(np.trace(inverse @ (information - np.eye(len(unknowns)))))
+    spread = float(np.sqrt(np.sum(residual**2) / max(residual.size - used, 1.0)))
+    covariance = _clustered(rows, residual / finest, inverse)
+    spread = max(spread, 1e-3 * finest)  # simulated logs without noise
+    return ArmFit(
+        model, unknowns, covariance * np.outer(model.scale, model.scale),
+        information_of(model, unknowns, spread)[1], model.link_angles(unknowns)[0], residual, spread,
+        freedom=max(len(residual) - int(np.ceil(used / residual.shape[1])), 1),
+    )  # fmt: skip
+
+
+def _clustered(rows: Array, residual: Array, inverse: Array) -> Array:
+    """Cluster-robust covariance, a cluster per pose, see the module, in units of the scales."""
+    count, each = residual.shape
+    leverage = rows @ inverse @ rows.transpose(0, 2, 1)
+    without = np.linalg.solve(np.eye(each) - leverage, residual[..., None])
+    score = (rows.transpose(0, 2, 1) @ without)[..., 0]
+    middle = (count - 1) / count * score.T @ score + np.eye(len(inverse))
+    return inverse @ middle @ inverse
+
+
+def in_unit(noise: float, kind: Kind) -> str:
+    """Noise of a measurement with its unit, as tables show it."""
+    unit = measurement_unit(kind)
+    return f"{noise:.3g} {unit}" if unit == "N·m" else f"{1e3 * noise:.3g} m{unit}"
+
+
+def summed_up(fit: ArmFit) -> str:
+    """The residuals in a sentence, with what friction means for the intervals."""
+    friction = (
+        "friction is separated by the sides of approach"
+        if fit.model.log.direction is not None
+        else "the log has no sides of approach: friction counts as noise, and the intervals contain it"
+    )
+    return f"residual spread {in_unit(fit.spread, fit.model.log.kind)}; {friction}"

@@ -1,0 +1,278 @@
+"""A user's log of static poses: a CSV file with a row per pose and columns `quantity.joint [unit]`.
+
+docs/identification.md describes it.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NoReturn
+
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.signals import Array
+
+Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
+"""What a log has besides the motor encoders."""
+
+KINDS: dict[str, tuple[Kind, str]] = {
+    "q": ("link_encoders", "rad"),
+    "end_effector": ("end_effector", "m"),
+    "imu": ("imu", "rad"),
+    "torque": ("torques", "N·m"),
+}
+"""Quantity of a column: what it is of, and its unit."""
+AXES: dict[Kind, tuple[str, ...]] = {"end_effector": ("x", "y", "z"), "imu": ("roll", "pitch")}
+"""Columns of what has no joints."""
+UNITS = {"theta": "rad", "direction": "1", **{name: unit for name, (_, unit) in KINDS.items()}}
+MOST_POSES = 10_000
+"""Rows of a log."""
+
+_LARGEST_BYTES = 50_000_000
+_HEADER = re.compile(r"^\s*([^\s.\[\]]+)\.(.+?)\s*(?:\[\s*([^\]]*?)\s*\])?\s*$")
+_SPELT = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
+_BEYOND_RAD = 0.5  # homing errors and bent joints may exceed the range of the model by less
+_TURNS_RAD = 4.0 * math.pi  # of joints without a range
+_ALIKE_RAD = 1e-3
+
+
+@dataclass(frozen=True)
+class PoseLog:
+    """Static poses and what was measured at them.
+
+    Attributes:
+        joints: Names of the joints, (n,).
+        theta: Motor encoders, (N, n) [rad].
+        kind: What else was measured.
+        columns: Joints or axes of the measurement, (m,).
+        measured: The measurement, (N, m), in the unit of its kind.
+        direction: Side of approach, (N, n): +1 from below, -1 from above, 0 unknown; None where the log has none.
+    """
+
+    joints: tuple[str, ...]
+    theta: Array
+    kind: Kind
+    columns: tuple[str, ...]
+    measured: Array
+    direction: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+
+def read_log(path: Path, ranges: Mapping[str, tuple[float, float]], kind: Kind | None = None) -> PoseLog:
+    """Read and check a log.
+
+    Args:
+        path: CSV file with a header.
+        ranges: Hinges of the robot and their ranges, infinite where there is none [rad].
+        kind: Measurement to use; needed only where the log has several.
+
+    Raises:
+        ConfigurationError: The log cannot be used; the message says what to change.
+    """
+    columns = _columns(path)
+    names = {
+        quantity: [key.split(".", 1)[1] for key in columns if key.startswith(f"{quantity}.")] for quantity in UNITS
+    }
+    for quantity in ("theta", "q", "torque", "direction"):
+        for joint in names[quantity]:
+            if joint not in ranges:
+                raise ConfigurationError(f"{path}, column {quantity}.{joint}: {unknown_name('joint', joint, ranges)}")
+    joints = tuple(joint for joint in ranges if joint in names["theta"])
+    if not joints:
+        raise ConfigurationError(
+            f"{path} has no motor encoders; give a column theta.JOINT [rad] for each of: {', '.join(ranges)}"
+        )
+    quantity = _quantity(path, [name for name in KINDS if names[name]], kind)
+    chosen = KINDS[quantity][0]
+    _require_columns(path, chosen, names[quantity], joints)
+    order = AXES.get(chosen) or tuple(joint for joint in joints if joint in names[quantity])
+    log = PoseLog(
+        joints, _table(columns, "theta", joints), chosen, order, _table(columns, quantity, order),
+        _directions(path, columns, joints) if names["direction"] else None,
+    )  # fmt: skip
+    _require_radians(path, "theta", joints, log.theta, ranges)
+    if chosen == "link_encoders":
+        _require_radians(path, "q", order, log.measured, ranges)
+    if chosen == "imu":
+        _require_radians(path, "imu", order, log.measured, dict.fromkeys(order, (-math.pi, math.pi)))
+    if np.ptp(log.theta, axis=0).max() < _ALIKE_RAD:
+        raise ConfigurationError(
+            f"all {len(log)} poses of {path} are alike: no joint moves by {_ALIKE_RAD} rad; log poses that differ in "
+            "all joints, such as those that --plan proposes"
+        )
+    return averaged(log)
+
+
+def averaged(log: PoseLog) -> PoseLog:
+    """The log with consecutive rows of one pose, whose encoders and sides of approach agree, as their mean.
+
+    Their friction and the errors of the model are the same, so that they do not count as independent.
+    """
+    sides = np.zeros_like(log.theta) if log.direction is None else log.direction
+    starts = [0]
+    for row in range(1, len(log)):
+        moved = np.abs(log.theta[row] - log.theta[starts[-1]]).max() > _ALIKE_RAD
+        if moved or (sides[row] != sides[starts[-1]]).any():
+            starts.append(row)
+    count = np.diff([*starts, len(log)])[:, None]
+    return replace(
+        log,
+        theta=np.add.reduceat(log.theta, starts) / count,
+        measured=np.add.reduceat(log.measured, starts) / count,
+        direction=None if log.direction is None else sides[starts],
+    )
+
+
+def write_poses(path: Path, columns: Mapping[str, Array]) -> Path:
+    """Write columns such as `theta.elbow`, each (N,), as a log with units in its header."""
+    units = [UNITS[name.split(".", 1)[0]] for name in columns]
+    header = [name if unit == "1" else f"{name} [{unit}]" for name, unit in zip(columns, units, strict=True)]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([[f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True)])
+    return path
+
+
+def _columns(path: Path) -> dict[str, Array]:
+    """All columns of the file by their names without units."""
+    rows = _rows(path)
+    if not rows:
+        raise ConfigurationError(f"{path} is empty; its first line must name columns such as theta.JOINT [rad]")
+    names, given = [_name(path, text) for text in rows[0]], rows[1:]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigurationError(f"{path} has the column {twice[0]} twice; keep one of them")
+    if not 0 < len(given) <= MOST_POSES:
+        raise ConfigurationError(f"{path} must have 1 to {MOST_POSES} poses, a line each, it has {len(given)}")
+    values = np.array([_numbers(path, line, names, row) for line, row in enumerate(given, start=2)])
+    return dict(zip(names, values.T, strict=True))
+
+
+def _rows(path: Path) -> list[list[str]]:
+    """Lines of the file that are not empty."""
+    if not path.is_file():
+        raise ConfigurationError(f"no log at {path}; give a CSV file of static poses, see docs/identification.md")
+    if path.stat().st_size > _LARGEST_BYTES:
+        raise ConfigurationError(f"{path} must have at most {_LARGEST_BYTES} bytes, it has {path.stat().st_size}")
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+    except (UnicodeDecodeError, csv.Error, OSError) as error:
+        raise ConfigurationError(f"{path} is no CSV file in UTF-8: {error}") from None
+
+
+def _name(path: Path, text: str) -> str:
+    """A column's name without its unit."""
+    found = _HEADER.match(text)
+    if found is None or found[1] not in UNITS:
+        raise ConfigurationError(
+            f"{path} has the column {shown(text)}; columns are theta.JOINT, q.JOINT, torque.JOINT, direction.JOINT, "
+            "end_effector.x, .y, .z, imu.roll and imu.pitch"
+        )
+    quantity, of, unit = found[1], found[2], found[3]
+    if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
+        raise ConfigurationError(
+            f"{path}, column {quantity}.{of}: the unit must be [{UNITS[quantity]}], got [{unit}]; convert the column"
+        )
+    return f"{quantity}.{of}"
+
+
+def _numbers(path: Path, line: int, names: Sequence[str], row: Sequence[str]) -> list[float]:
+    """Finite numbers of a line."""
+    if len(row) != len(names):
+        raise ConfigurationError(
+            f"{path}, pose {line - 1}: {len(names)} values are needed, one a column, got {len(row)}"
+        )
+    values = []
+    for name, text in zip(names, row, strict=True):
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ConfigurationError(
+                f"{path}, pose {line - 1}, column {name}: a finite number [{UNITS[name.split('.', 1)[0]]}] is needed, "
+                f"got {shown(text)}; measure the pose again or delete its line"
+            )
+        values.append(value)
+    return values
+
+
+def _table(columns: Mapping[str, Array], quantity: str, of: Iterable[str]) -> Array:
+    return np.stack([columns[f"{quantity}.{name}"] for name in of], axis=-1)
+
+
+def _quantity(path: Path, found: Sequence[str], kind: Kind | None) -> str:
+    """The quantity to use, as columns name it."""
+    kinds: dict[str, str] = {KINDS[name][0]: name for name in found}
+    if kind is not None and kind in kinds:
+        return kinds[kind]
+    if len(found) == 1 and kind is None:
+        return found[0]
+    if len(found) > 1:
+        raise ConfigurationError(
+            f"{path} has several measurements ({', '.join(kinds)}) and one is used; choose it by --measured-by"
+        )
+    missing = f"none of {kind}" if kind else "none"
+    raise ConfigurationError(
+        f"{path} needs a measurement besides the motor encoders and has {missing}; add columns q.JOINT [rad], "
+        "end_effector.x, .y, .z [m], imu.roll, imu.pitch [rad], or torque.JOINT [N·m]"
+    )
+
+
+def _require_columns(path: Path, kind: Kind, given: Sequence[str], joints: Sequence[str]) -> None:
+    """Refuse axes that are missing or unknown, and measurements of joints without a motor encoder."""
+    if kind in AXES and sorted(given) != sorted(AXES[kind]):
+        raise ConfigurationError(
+            f"{path}: {kind} needs exactly the columns {', '.join(AXES[kind])}, got {', '.join(given)}"
+        )
+    if kind not in AXES and (without := [joint for joint in given if joint not in joints]):
+        raise ConfigurationError(f"{path} measures {', '.join(without)} and lacks theta.{without[0]}; add the column")
+
+
+def _directions(path: Path, columns: Mapping[str, Array], joints: Sequence[str]) -> Array:
+    """Sides of approach, zero for joints without a column."""
+    zero = np.zeros(len(columns[f"theta.{joints[0]}"]))
+    table = np.stack([columns.get(f"direction.{joint}", zero) for joint in joints], axis=-1)
+    if not np.isin(table, (-1.0, 0.0, 1.0)).all():
+        raise ConfigurationError(
+            f"{path}: directions must be 1 (approached from below), -1 (from above) or 0 (unknown), "
+            f"got {table[~np.isin(table, (-1.0, 0.0, 1.0))][0]:g}"
+        )
+    return table
+
+
+def _require_radians(
+    path: Path, quantity: str, of: Sequence[str], angles: Array, ranges: Mapping[str, tuple[float, float]]
+) -> None:
+    """Refuse angles that the joints cannot reach, such as degrees."""
+    bounds = np.array([ranges[name] for name in of])
+    finite = np.isfinite(bounds)
+    low = np.where(finite[:, 0], bounds[:, 0] - _BEYOND_RAD, -_TURNS_RAD)
+    high = np.where(finite[:, 1], bounds[:, 1] + _BEYOND_RAD, _TURNS_RAD)
+    beyond = (angles < low) | (angles > high)
+    if beyond.any():
+        pose, column = np.argwhere(beyond)[0]
+        in_degrees = np.deg2rad(angles)
+        is_degrees = bool(((in_degrees >= low) & (in_degrees <= high)).all())
+        _refuse_angle(
+            path, f"{quantity}.{of[column]}", float(angles[pose, column]), bounds[column], is_degrees, int(pose)
+        )
+
+
+def _refuse_angle(path: Path, name: str, angle: float, bounds: Array, is_degrees: bool, pose: int) -> NoReturn:
+    cure = (
+        "the angles look like degrees: convert them to radians"
+        if is_degrees
+        else "give angles in radians, in the zero and the sign of the model"
+    )
+    raise ConfigurationError(
+        f"{path}, pose {pose + 1}, column {name}: {angle:g} rad lies beyond the joint's range of {bounds[0]:g} to "
+        f"{bounds[1]:g} rad; {cure}"
+    )

@@ -1,0 +1,281 @@
+r"""What static poses show of an arm with elastic joints, and how that changes with the unknowns.
+
+The encoders read θ + o. At rest the transmissions carry
+
+.. math:: K (\theta - q) = \tau(q) + m\, b(q) + F d
+
+with the gravity torque τ, a payload m that adds b per kilogram, and friction on the link side of the springs: F d after
+an approach from the side d = ±1. Unknown are the compliances c = 1/K, in which the deflection is linear, the offsets o,
+and where asked F, m, and the frame of the measurement. Link encoders show q, a tracker R p(q) + t, an IMU its link's
+vertical, and torque sensors the right-hand side. Derivatives follow from
+
+.. math:: (1 + C\, \partial\tau/\partial q)\, dq = -do - (\tau + m b + F d)\, dc - C (b\, dm + d\, dF)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from baselines.identification.pose_log import Kind, PoseLog
+from baselines.identification.static_arm import StaticArm
+from elastic_env.core.errors import ElasticError
+from elastic_env.core.signals import Array, IntArray
+
+Frame = Literal["known", "offset", "pose"]
+"""What is known of the measurement's frame: all, its directions, or nothing."""
+
+LARGEST_DEFLECTION_RAD = 0.3
+"""Scale of the unknown compliances: the largest torque of a joint bends it by about as much, or less."""
+SMALLEST_LOAD = 1e-3
+"""Share of the largest torque in the arm below which a joint counts as not loaded."""
+
+_PRIOR = {"offset": 0.3, "payload_kg": 10.0, "translation_m": 1.0, "rotation_rad": 0.3}
+_FIRST_ITERATIONS, _MOST_ITERATIONS, _LAST_STEP_RAD = 6, 50, 1e-12
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Where the unknowns stand in one vector: c, o, F of the elastic joints, m, then the frame.
+
+    Attributes:
+        elastic: Positions of the joints whose stiffness is sought, (k,).
+        friction: Whether F is unknown.
+        payload: Whether m is unknown.
+        translation: Whether the frame's origin is unknown.
+        rotation: Whether its directions are.
+    """
+
+    elastic: IntArray
+    friction: bool
+    payload: bool
+    translation: bool
+    rotation: bool
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Part of the vector for each kind of unknown."""
+        k = len(self.elastic)
+        sizes = {
+            "compliance": k, "offset": k, "friction": k * self.friction, "payload": int(self.payload),
+            "translation": 3 * self.translation, "rotation": 3 * self.rotation,
+        }  # fmt: skip
+        ends = np.cumsum(list(sizes.values()))
+        return {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.slices["rotation"].stop
+
+    @staticmethod
+    def of(log: PoseLog, elastic: Sequence[str], frame: Frame, payload: bool) -> "Unknowns":
+        """The unknowns that a log needs."""
+        return Unknowns(
+            elastic=np.array([log.joints.index(joint) for joint in elastic]),
+            friction=log.direction is not None,
+            payload=payload,
+            translation=log.kind == "end_effector" and frame != "known",
+            rotation=(log.kind == "end_effector" and frame == "pose") or (log.kind == "imu" and frame != "known"),
+        )
+
+
+@dataclass(frozen=True)
+class PoseModel:
+    """Measurements of poses as a function of the unknowns.
+
+    Attributes:
+        arm: The rigid arm.
+        log: The poses; `measured` is used only to find the axes of an IMU and the frame to begin with.
+        unknowns: What is sought.
+    """
+
+    arm: StaticArm
+    log: PoseLog
+    unknowns: Unknowns
+
+    @cached_property
+    def load(self) -> Array:
+        """Largest torque of each elastic joint in these poses, (k,) [N·m]."""
+        return np.abs(self.arm.torque(self.log.theta)).max(axis=0)[self.unknowns.elastic]
+
+    @cached_property
+    def scale(self) -> Array:
+        """Plausible size of each unknown, (p,)."""
+        own, largest = self.unknowns.slices, max(float(np.abs(self.arm.torque(self.log.theta)).max()), 1e-9)
+        load = np.maximum(self.load, SMALLEST_LOAD * largest)
+        scale = np.empty(self.unknowns.size)
+        scale[own["compliance"]] = LARGEST_DEFLECTION_RAD / load
+        scale[own["offset"]] = _PRIOR["offset"]
+        scale[own["friction"]] = load[: own["friction"].stop - own["friction"].start]
+        scale[own["payload"]] = _PRIOR["payload_kg"]
+        scale[own["translation"]], scale[own["rotation"]] = _PRIOR["translation_m"], _PRIOR["rotation_rad"]
+        return scale
+
+    def start_with(self, deflection_rad: float) -> Array:
+        """Unknowns to begin with, (p,): joints that bend by as much under their largest torque, and zeros."""
+        values = np.zeros(self.unknowns.size)
+        compliance = self.unknowns.slices["compliance"]
+        values[compliance] = self.scale[compliance] * deflection_rad / LARGEST_DEFLECTION_RAD
+        return values
+
+    @cached_property
+    def _aligned(self) -> Array:
+        """Rotation of the frame to begin with, (3, 3)."""
+        if not self.unknowns.rotation:
+            return np.eye(3)
+        at = self.arm.attitude(self.log.theta)
+        shown, own = self.log.measured, at.position
+        if self.log.kind == "imu":
+            shown, own = vertical(self.log.measured), at.rotation.transpose(0, 2, 1) @ self.arm.up
+            return Rotation.align_vectors(shown, own)[0].as_matrix()
+        return Rotation.align_vectors(shown - shown.mean(axis=0), own - own.mean(axis=0))[0].as_matrix()
+
+    @property
+    def target(self) -> Array:
+        """What `predicted` has to meet, (N, m)."""
+        return np.zeros((len(self.log), 2)) if self.log.kind == "imu" else self.log.measured
+
+    def expand(self, unknowns: Array, name: str) -> Array:
+        """One of c, o, F of all joints, zero where it is not sought, (n,)."""
+        values, own = np.zeros(len(self.log.joints)), unknowns[self.unknowns.slices[name]]
+        values[self.unknowns.elastic[: len(own)]] = own
+        return values
+
+    def payload_kg(self, unknowns: Array) -> float:
+        """Mass of the payload [kg]."""
+        return float(unknowns[self.unknowns.slices["payload"]].sum())
+
+    def torque(self, unknowns: Array, q: Array) -> Array:
+        """What the transmissions carry at link angles, (N, n) [N·m]."""
+        torque = self.arm.torque(q)
+        if self.unknowns.payload:
+            torque = torque + self.payload_kg(unknowns) * self.arm.payload_torque(q)
+        if self.log.direction is not None:
+            torque = torque + self.expand(unknowns, "friction") * self.log.direction
+        return torque
+
+    def link_angles(self, unknowns: Array) -> tuple[Array, Array]:
+        """Link angles at rest, (N, n) [rad], and (1 + C ∂τ/∂q)⁻¹ there, (N, n, n).
+
+        Raises:
+            ElasticError: The load overcomes a spring.
+        """
+        theta = self.log.theta - self.expand(unknowns, "offset")
+        compliance = self.expand(unknowns, "compliance")
+        q = theta
+        for _ in range(
+            _FIRST_ITERATIONS
+        ):  # shrink the error by about τ′/K each, so that derivatives are taken in place
+            q = theta - compliance * self.torque(unknowns, q)
+        gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns))
+        inverse = np.linalg.inv(np.eye(len(compliance)) + compliance[:, None] * gradient)
+        for _ in range(_MOST_ITERATIONS):
+            step = inverse @ (q - theta + compliance * self.torque(unknowns, q))[..., None]
+            q = q - step[..., 0]
+            if not np.abs(step).max() > _LAST_STEP_RAD:
+                return q, inverse
+        raise ElasticError(
+            "no link angles for these poses: gravity overcomes the springs that the log implies; check signs, zeros, "
+            "units and frame (--frame) of its columns, and the masses of the model"
+        )
+
+    def predicted(self, unknowns: Array) -> tuple[Array, Array]:
+        """Measurements, (N, m), and their derivatives by the unknowns, (N, m, p)."""
+        q, inverse = self.link_angles(unknowns)
+        dq = self._link_gradient(unknowns, q, inverse)
+        if self.log.kind == "end_effector":
+            return self._positions(unknowns, q, dq)
+        if self.log.kind == "imu":
+            return self._verticals(unknowns, q, dq)
+        at = [self.log.joints.index(joint) for joint in self.log.columns]
+        if self.log.kind == "link_encoders":
+            return q[:, at], dq[:, at]
+        return self._torques(unknowns, q, dq, at)
+
+    def _link_gradient(self, unknowns: Array, q: Array, inverse: Array) -> Array:
+        """∂q/∂unknowns, (N, n, p)."""
+        own, elastic, compliance = self.unknowns.slices, self.unknowns.elastic, self.expand(unknowns, "compliance")
+        gradient = np.zeros((*q.shape, self.unknowns.size))
+        gradient[..., own["compliance"]] = -(inverse * self.torque(unknowns, q)[:, None])[..., elastic]
+        gradient[..., own["offset"]] = -inverse[..., elastic]
+        if self.log.direction is not None:
+            gradient[..., own["friction"]] = -(inverse * (compliance * self.log.direction)[:, None])[..., elastic]
+        if self.unknowns.payload:
+            gradient[..., own["payload"]] = -inverse @ (compliance * self.arm.payload_torque(q))[..., None]
+        return gradient
+
+    def _turned(self, unknowns: Array) -> Array:
+        """Rotation from the model's to the measurement's frame, (3, 3)."""
+        turn = unknowns[self.unknowns.slices["rotation"]]
+        return Rotation.from_rotvec(turn).as_matrix() @ self._aligned if len(turn) else self._aligned
+
+    def _positions(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
+        """What a tracker shows [m]."""
+        own, R, at = self.unknowns.slices, self._turned(unknowns), self.arm.attitude(q)
+        turned = at.position @ R.T
+        gradient = R @ at.position_gradient @ dq
+        gradient[..., own["translation"]] = np.eye(3)[:, : 3 * self.unknowns.translation]
+        if self.unknowns.rotation:
+            gradient[..., own["rotation"]] = -_cross(turned)
+        shift = unknowns[own["translation"]]
+        return turned + (shift if len(shift) else 0.0), gradient
+
+    def _verticals(self, unknowns: Array, q: Array, dq: Array) -> tuple[Array, Array]:
+        """Tilt between the vertical that the IMU should see and the one that it saw, about two axes [rad]."""
+        own, R, at, up = self.unknowns.slices, self._turned(unknowns), self.arm.attitude(q), self.arm.up
+        across = _across(vertical(self.log.measured))
+        back = R @ at.rotation.transpose(0, 2, 1)
+        seen = back @ up
+        gradient = back @ _cross(np.broadcast_to(up, seen.shape)) @ at.rotation_gradient @ dq
+        if self.unknowns.rotation:
+            gradient[..., own["rotation"]] = -_cross(seen)
+        return (across @ seen[..., None])[..., 0], across @ gradient
+
+    def _torques(self, unknowns: Array, q: Array, dq: Array, at: list[int]) -> tuple[Array, Array]:
+        """What torque sensors show [N·m]."""
+        own, elastic = self.unknowns.slices, self.unknowns.elastic
+        gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns)) @ dq
+        if self.log.direction is not None:
+            gradient[..., own["friction"]] += (np.eye(q.shape[1]) * self.log.direction[:, None])[..., elastic]
+        if self.unknowns.payload:
+            gradient[..., own["payload"]] += self.arm.payload_torque(q)[..., None]
+        return self.torque(unknowns, q)[:, at], gradient[:, at]
+
+
+def vertical(attitude: Array) -> Array:
+    """Unit vector against gravity in the frame of an IMU, from roll and pitch, (N, 2) [rad] to (N, 3).
+
+    Of R = R_z(yaw) R_y(pitch) R_x(roll), from the IMU's to the world's frame, it is the last row.
+    """
+    roll, pitch = attitude[..., 0], attitude[..., 1]
+    return np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)], axis=-1)
+
+
+def roll_and_pitch(direction: Array) -> Array:
+    """The inverse of `vertical`, (N, 3) to (N, 2) [rad]."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    return np.stack([np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))], axis=-1)
+
+
+def measurement_unit(kind: Kind) -> str:
+    """Unit of a measurement's residual."""
+    return {"end_effector": "m", "torques": "N·m"}.get(kind, "rad")
+
+
+def _across(directions: Array) -> Array:
+    """Two unit vectors across each direction, (N, 3) to (N, 2, 3)."""
+    least = np.eye(3)[np.abs(directions).argmin(axis=-1)]
+    first = np.cross(directions, least)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(directions, first)], axis=-2)
+
+
+def _cross(vectors: Array) -> Array:
+    """Matrices of the cross product with vectors from the left, (N, 3) to (N, 3, 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], axis=-2)

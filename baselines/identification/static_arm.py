@@ -1,0 +1,163 @@
+"""An arm at rest as identification needs it: torques with and without a payload, and where a body of it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from baselines.compensation.position_compensator import PositionCompensator
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array
+
+_STEP_RAD = 1e-4  # of central differences: an error of 1e-9 relative
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """Poses of a body or site, and how they change with the joints.
+
+    Attributes:
+        position: In the model's world frame, (N, 3) [m].
+        rotation: From its frame to the world's, (N, 3, 3).
+        position_gradient: (N, 3, n) [m/rad].
+        rotation_gradient: Of the angular velocity by the joint rates, (N, 3, n).
+    """
+
+    position: Array
+    rotation: Array
+    position_gradient: Array
+    rotation_gradient: Array
+
+
+class StaticArm:
+    """Torques and poses of a rigid model at rest.
+
+    Args:
+        model: Compiled rigid model on a fixed base.
+        joints: Hinges in the order of all arrays; the others are held, see `PositionCompensator`.
+        end_effector: Site or body that is measured; None for the outermost body.
+        payload: Body or site that carries a payload of unknown mass at its origin; None for no payload.
+
+    Raises:
+        ConfigurationError: The model cannot be used, or a name does not exist.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        end_effector: str | None = None,
+        payload: str | None = None,
+    ) -> None:
+        self.model, self.joints = model, tuple(joints)
+        # rigid: it lends its torque, in which springs, `gravcomp` and held joints are taken into account
+        self._bare = PositionCompensator(model, np.inf, joints=joints)
+        self._loaded: PositionCompensator | None = None
+        if payload is not None:
+            body, place = _place(model, payload)
+            self._loaded = PositionCompensator(model, np.inf, joints=joints)
+            self._loaded.set_payload(1.0, place, model.body(body).name)
+        self._data = mujoco.MjData(model)
+        if model.nkey:
+            self._data.qpos[:] = model.key_qpos[0]
+        self._at = np.array([model.joint(joint).qposadr[0] for joint in joints])
+        self._dofs = np.array([model.joint(joint).dofadr[0] for joint in joints])
+        self.end_effector = _outermost(model) if end_effector is None else end_effector
+        self._body, self._point = _place(model, self.end_effector)
+        self._turn = _turn(model, self.end_effector)
+        at = [int(model.joint(name).id) for name in joints]
+        limited = model.jnt_limited[at].astype(bool)[:, None]
+        self.ranges = np.where(limited, model.jnt_range[at], [-np.inf, np.inf])
+
+    @property
+    def up(self) -> Array:
+        """Unit vector against gravity in the world frame, (3,)."""
+        return -self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity)
+
+    def require_gravity(self) -> None:
+        """Refuse a model in which nothing bends a joint.
+
+        Raises:
+            ConfigurationError: It has no gravity.
+        """
+        if not self.model.opt.gravity.any():
+            raise ConfigurationError("the model has no gravity, so nothing bends its joints; set <option gravity=...>")
+
+    def torque(self, q: Array) -> Array:
+        """Torque that holds the arm without payload, (N, n) [rad] to (N, n) [N·m]."""
+        return _rows(self._bare, q)
+
+    def payload_torque(self, q: Array) -> Array:
+        """What a payload of 1 kg adds, (N, n) [rad] to (N, n) [N·m]; zero without a payload."""
+        return np.zeros(q.shape) if self._loaded is None else _rows(self._loaded, q) - _rows(self._bare, q)
+
+    def torque_gradient(self, q: Array, payload_kg: float = 0.0) -> Array:
+        """∂τ/∂q by central differences, (N, n) [rad] to (N, n, n) [N·m/rad]."""
+        columns = []
+        for step in _STEP_RAD * np.eye(q.shape[-1]):
+            change = self.torque(q + step) - self.torque(q - step)
+            if payload_kg:
+                change += payload_kg * (self.payload_torque(q + step) - self.payload_torque(q - step))
+            columns.append(change / (2.0 * _STEP_RAD))
+        return np.stack(columns, axis=-1)
+
+    def attitude(self, q: Array) -> Attitude:
+        """Where the end effector is, (N, n) [rad]."""
+        count, n = q.shape
+        found = Attitude(*(np.empty((count, 3, k) if k else (count, 3)) for k in (0, 3, n, n)))
+        jacobians: Any = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
+        for i, row in enumerate(q):
+            self._data.qpos[self._at] = row
+            mujoco.mj_kinematics(self.model, self._data)
+            mujoco.mj_comPos(self.model, self._data)
+            turn = self._data.xmat[self._body].reshape(3, 3)
+            found.rotation[i] = turn @ self._turn
+            found.position[i] = self._data.xpos[self._body] + turn @ self._point
+            mujoco.mj_jac(self.model, self._data, *jacobians, found.position[i], self._body)
+            found.position_gradient[i], found.rotation_gradient[i] = (part[:, self._dofs] for part in jacobians)
+        return found
+
+
+def hinges_of(model: mujoco.MjModel) -> list[str]:
+    """Names of the hinges of a model."""
+    return [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+
+
+def _rows(compensator: PositionCompensator, q: Array) -> Array:
+    return np.array([compensator.torque(row) for row in q])
+
+
+def _sites(model: mujoco.MjModel) -> list[str]:
+    return [model.site(i).name for i in range(model.nsite)]
+
+
+def _bodies(model: mujoco.MjModel) -> list[str]:
+    return [model.body(i).name for i in range(1, model.nbody)]
+
+
+def _place(model: mujoco.MjModel, name: str) -> tuple[int, Array]:
+    """Body of a site or body, and the place of its origin in the body's frame [m]."""
+    if name in _sites(model):
+        site = model.site(name)
+        return int(site.bodyid[0]), site.pos.copy()
+    if name in _bodies(model):
+        return int(model.body(name).id), np.zeros(3)
+    raise unknown_name("site or body", name, [*_sites(model), *_bodies(model)])
+
+
+def _turn(model: mujoco.MjModel, name: str) -> Array:
+    """Rotation from the frame of a site or body to the frame of its body, (3, 3)."""
+    turn = np.eye(3).ravel()
+    if name in _sites(model):
+        mujoco.mju_quat2Mat(turn, model.site(name).quat)
+    return turn.reshape(3, 3)
+
+
+def _outermost(model: mujoco.MjModel) -> str:
+    """The body with the most bodies between it and the base, the last one of several."""
+    depth = np.zeros(model.nbody, dtype=np.int64)
+    for body in range(1, model.nbody):
+        depth[body] = depth[model.body_parentid[body]] + 1
+    return model.body(int(model.nbody - 1 - depth[::-1].argmax())).name

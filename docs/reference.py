@@ -1,0 +1,87 @@
+"""The reference pages that are written from the code: environments, commands, and the equations' functions."""
+
+import contextlib
+import io
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import gymnasium
+
+from elastic_env import IDS
+from elastic_env.core.signals import Signal
+from elastic_env.runtime.scenario import scenario_names
+from train.commands.cli import main
+
+COMMANDS = ("identify", "evaluate", "compare", "train", "iterate", "export", "bench", "speed", "play", "demo")
+"""Commands whose help is shown; that of `hardware` stands in its parts."""
+HARDWARE = ("scan", "check", "run", "emulate")
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _signals(signals: Iterable[Signal]) -> str:
+    rows = ([str(i), f"`{s.name}`", s.unit, s.meaning] for i, s in enumerate(signals))
+    return table(["column", "name", "unit", "meaning"], rows)
+
+
+def environments_page() -> str:
+    """Every simulated environment: id, observation, action, metrics, from the declarations in the code."""
+    parts = ["# Environments", "Written from the declarations in the code. [Options](../options.md) has all arguments."]
+    for name, known in IDS.items():
+        if name == "hardware":
+            continue
+        env = gymnasium.make(known, disable_env_checker=True).unwrapped
+        task = env.task
+        scenarios = ", ".join(f"`{scenario}`" for scenario in scenario_names(walks=name == "walker"))
+        metrics = ", ".join(f"`{metric.name}`" for metric in task.metrics)
+        parts += [
+            f"## `{known}`",
+            f"Control period {1e3 * task.num_substeps * task.model.opt.timestep:g} ms. On the command line: `{name}`.",
+            f"**Scenarios**: {scenarios}.",
+            "**Observation** (float64, one world):",
+            _signals(task.observation_table),
+            "**Action** (float32, one world), within the bounds of `env.action_space`:",
+            _signals(task.action_table),
+            f"**Episode metrics**, in `info['episode_metrics']` at the last step: {metrics}.",
+        ]
+        env.close()
+    parts += [
+        f"## `{IDS['hardware']}`",
+        "The testbed on a real servo, or an emulated one. Spaces and `info` are those of the simulated testbed. "
+        "[Hardware](../hardware.md) has its arguments.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def help_of(*words: str) -> str:
+    """What `elastic WORDS --help` prints, without colours."""
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).rstrip()
+    return "\n".join(
+        textwrap.fill(line, 78, subsequent_indent="") if line[:1].isalpha() else line for line in plain.splitlines()
+    )
+
+
+def commands_page() -> str:
+    """`--help` of every command."""
+    parts = ["# Commands: help", "Output of `--help`. [Commands](../commands.md) has examples and durations."]
+    for words in [*((command,) for command in COMMANDS), *(("hardware", part) for part in HARDWARE)]:
+        parts += [f"## elastic {' '.join(words)}", f"```text\n{help_of(*words)}\n```"]
+    return "\n\n".join(parts) + "\n"
+
+
+def write_reference(folder: Path) -> None:
+    """Write the generated pages; a page that has not changed is left alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in (("environments.md", environments_page()), ("help.md", commands_page())):
+        page = folder / name
+        if not page.is_file() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")

@@ -1,0 +1,106 @@
+"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of `elastic_env.dynamics.tree_kernels`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.tree_kernels import LINK
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links of a tree of hinges, and where the bodies of MuJoCo's model are in it.
+
+    Attributes:
+        links: Rows of `LINK`, the base first and parents before their children.
+        carrier: Link that every body moves with, 0 for the base.
+        place, R: Every body in the frame of that link.
+    """
+
+    links: Any
+    carrier: list[int]
+    place: Array
+    R: Array
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, float], gravcomp: bool) -> Self:
+        """Of a model whose other joints are held.
+
+        Args:
+            model: Compiled rigid model.
+            joints: Hinges that move, in the order of the last axis of arrays.
+            held: Position of every other joint, a hinge [rad] or a slide [m].
+            gravcomp: Whether `gravcomp` of the bodies takes from their weight.
+        """
+        data = mujoco.MjData(model)
+        for name, position in held.items():
+            data.qpos[model.joint(name).qposadr[0]] = position
+        mujoco.mj_kinematics(model, data)  # all that moves is where it is drawn
+        moving = sorted(model.joint(name).id for name in joints)
+        carrier = _carriers(model, moving)
+        R_wl = np.stack([np.eye(3), *(_frame_about(data.xaxis[j]) for j in moving)])
+        p_wl = np.stack([np.zeros(3), *(data.xanchor[j] for j in moving)])
+        R_lw = R_wl[carrier].transpose(0, 2, 1)
+        links = _jointed(model, joints, moving, carrier)
+        for i in range(1, len(links)):
+            parent = links[i]["parent"]
+            links[i]["R"] = R_wl[parent].T @ R_wl[i]
+            links[i]["anchor"] = R_wl[parent].T @ (p_wl[i] - p_wl[parent])
+        com, R_li = _turned(R_lw, data.xipos - p_wl[carrier]), R_lw @ data.ximat.reshape(-1, 3, 3)
+        for b in range(1, model.nbody):
+            inertia = R_li[b] @ np.diag(model.body_inertia[b]) @ R_li[b].T
+            share = 1.0 - float(model.body_gravcomp[b]) if gravcomp else 1.0
+            _add(links[carrier[b]], float(model.body_mass[b]), com[b], inertia, share)
+        place = _turned(R_lw, data.xpos - p_wl[carrier])
+        return cls(links, carrier, place, R_lw @ data.xmat.reshape(-1, 3, 3))
+
+    def loaded(self, body: int, mass: float, place: Array) -> Any:
+        """The links with one point mass more, in the frame of a body [kg], [m]."""
+        links, carrier = self.links.copy(), self.carrier[body]
+        _add(links[carrier], mass, self.place[body] + self.R[body] @ place)
+        return links
+
+
+def _carriers(model: mujoco.MjModel, moving: Sequence[int]) -> list[int]:
+    """Link that every body moves with: that of its last moving joint, or of its parent."""
+    last = {int(model.jnt_bodyid[j]): i for i, j in enumerate(moving, start=1)}
+    carrier = [0]
+    for body in range(1, model.nbody):
+        carrier.append(last[body] if body in last else carrier[model.body_parentid[body]])
+    return carrier
+
+
+def _jointed(model: mujoco.MjModel, joints: Sequence[str], moving: Sequence[int], carrier: Sequence[int]) -> Any:
+    """Links that know their parents and their joints, without frames and masses."""
+    links = np.zeros(1 + len(moving), LINK)
+    for i, j in enumerate(moving, start=1):
+        body = int(model.jnt_bodyid[j])
+        is_first = i == 1 or model.jnt_bodyid[moving[i - 2]] != body
+        links[i]["parent"] = carrier[model.body_parentid[body]] if is_first else i - 1
+        links[i]["column"] = list(joints).index(model.joint(j).name)
+        links[i]["zero"] = model.qpos0[model.jnt_qposadr[j]]
+    return links
+
+
+def _add(link: Any, mass: float, com: Array, inertia: Array | float = 0.0, weight_share: float = 1.0) -> None:
+    """Give a link a further mass, with its inertia about its center of mass, and a share of its weight."""
+    link["mass"] += mass
+    link["moment"] += mass * com
+    link["inertia"] += inertia + mass * ((com @ com) * np.eye(3) - np.outer(com, com))
+    link["weight"] += weight_share * mass
+    link["weight_moment"] += weight_share * mass * com
+
+
+def _frame_about(axis: Array) -> Array:
+    """A right-handed frame with its z axis along a unit vector, as columns."""
+    x = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
+def _turned(R: Array, vectors: Array) -> Array:
+    return (R @ vectors[..., None])[..., 0]

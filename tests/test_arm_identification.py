@@ -1,0 +1,499 @@
+"""Stiffness of an arm from static poses: against equilibria of MuJoCo, with intervals that hold the truth."""
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.optimize import root
+from scipy.spatial.transform import Rotation
+
+from baselines import PositionCompensator
+from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
+from baselines.identification.arm_result import described
+from baselines.identification.pose_log import Kind, PoseLog, read_log
+from baselines.identification.pose_model import PoseModel, Unknowns
+from baselines.identification.pose_plan import candidate_poses, plan_further
+from baselines.identification.static_arm import StaticArm
+from elastic_env.core.errors import ConfigurationError, ElasticError
+from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import parse_yaml
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.joint.make_elastic import make_elastic
+from train.commands.cli import main
+from train.figures.arm_plots import deflections
+
+FOLDER = Path(__file__).parents[1] / "docs" / "identification"
+ARM = mujoco.MjModel.from_xml_path(str(FOLDER / "arm.xml"))
+JOINTS = tuple(ARM.joint(i).name for i in range(ARM.njnt))
+K = np.array([2000.0, 1800.0, 1100.0, 900.0, 300.0, 250.0, 180.0])
+OFFSET = np.array([4.0, -6.0, 3.0, 5.0, -4.0, 6.0, -5.0]) * 1e-3
+FRICTION = np.array([2.0, 2.0, 1.5, 1.0, 0.5, 0.4, 0.3])
+COUNT = 2.0 * np.pi / 501_923
+NOISE: dict[Kind, float] = {"end_effector": 3e-4, "link_encoders": 1e-4, "imu": 5e-4, "torques": 0.05}
+TURN = Rotation.from_euler("xyz", [0.4, -0.2, 2.0])
+RANGES = {joint: tuple(ARM.joint(joint).range) for joint in JOINTS}
+
+
+def equilibria(theta: Array, load: Array, model: mujoco.MjModel = ARM) -> Array:
+    """Link angles at which springs hold MuJoCo's bias force and a further load, (N, n) [rad]."""
+    data = mujoco.MjData(model)
+
+    def imbalance(q: Array, theta: Array, load: Array) -> Array:
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        return theta - q - (data.qfrc_bias + load) / K
+
+    return np.array([root(imbalance, row, (row, own), tol=1e-13).x for row, own in zip(theta, load, strict=True)])
+
+
+def shown(kind: Kind, q: Array, load: Array) -> Array:
+    """What a sensor without noise shows, by MuJoCo: a tracker that is shifted and an IMU that is mounted askew."""
+    if kind == "link_encoders":
+        return q
+    data, rows = mujoco.MjData(ARM), []
+    for row, own in zip(q, load, strict=True):
+        data.qpos[:] = row
+        mujoco.mj_forward(ARM, data)
+        attitude = Rotation.from_matrix(data.site("marker").xmat.reshape(3, 3)) * TURN
+        _, pitch, roll = attitude.as_euler("ZYX")
+        rows.append(
+            {
+                "end_effector": data.site("marker").xpos + np.array([0.4, -1.2, 0.3]),
+                "imu": np.array([roll, pitch]),
+                "torques": data.qfrc_bias + own,
+            }[kind]
+        )
+    return np.array(rows)
+
+
+def poses(count: int, generator: np.random.Generator) -> Array:
+    """Motor angles within the ranges, (count, n) [rad]."""
+    return 0.9 * generator.uniform(*ARM.jnt_range.T, size=(count, len(JOINTS)))
+
+
+def log_of(kind: Kind, seed: int, count: int = 40, friction: float = 0.0, **options: Any) -> PoseLog:
+    """The log of an arm of known truth: noise in its usual size, and encoders that count."""
+    generator = np.random.default_rng(seed)
+    theta = options.get("theta", poses(count, generator))
+    direction = generator.choice([-1.0, 1.0], size=theta.shape)
+    load = friction * FRICTION * direction
+    measured = shown(kind, equilibria(theta, load), load)
+    measured = measured + options.get("noise", 1.0) * NOISE[kind] * generator.standard_normal(measured.shape)
+    columns = {"end_effector": ("x", "y", "z"), "imu": ("roll", "pitch")}.get(kind, JOINTS)
+    read = np.round((theta + OFFSET) / COUNT) * COUNT if options.get("noise", 1.0) else theta + OFFSET
+    return PoseLog(JOINTS, read, kind, columns, measured, direction if options.get("sides") else None)
+
+
+def model_of(log: PoseLog, elastic: tuple[str, ...] = JOINTS, **options: Any) -> PoseModel:
+    """The model of a log."""
+    arm = StaticArm(ARM, JOINTS, "marker", options.get("payload"))
+    return PoseModel(arm, log, Unknowns.of(log, elastic, options.get("frame", "offset"), "payload" in options))
+
+
+def errors(fit: ArmFit) -> Array:
+    """Relative errors of the compliances, (k,)."""
+    return fit.estimate("compliance")[0] * K - 1.0
+
+
+LOADED = slice(1, None)  # gravity does not load the vertical axis of the base
+
+
+def test_equilibrium_is_one_of_an_elastic_arm_in_mujoco() -> None:
+    """Catches a spring with the wrong sign, torque at θ in place of q, and a payload that is not where it is said."""
+    spec = mujoco.MjSpec.from_file(str(FOLDER / "arm.xml"))
+    body = spec.body("link7").add_body(name="weight", pos=[0.16, 0, 0.16])
+    body.mass, body.ipos, body.inertia, body.explicitinertial = 0.8, [0.0] * 3, [1e-9] * 3, True
+    elastic = make_elastic(
+        spec, {joint: ElasticJoint(stiffness=k, rotor_inertia=0.1) for joint, k in zip(JOINTS, K, strict=True)}
+    ).compile()
+    log = PoseLog(JOINTS, poses(3, np.random.default_rng(0)), "link_encoders", JOINTS, np.zeros((3, 7)))
+    model = model_of(log, payload="marker")
+    unknowns = np.zeros(model.unknowns.size)
+    unknowns[model.unknowns.slices["compliance"]], unknowns[model.unknowns.slices["payload"]] = 1.0 / K, 0.8
+    at, data = JointAddresses.of(elastic, JOINTS), mujoco.MjData(elastic)
+    for theta, q in zip(log.theta, model.link_angles(unknowns)[0], strict=True):
+        data.qpos[at.theta], data.qpos[at.q] = theta, q
+        mujoco.mj_forward(elastic, data)
+        np.testing.assert_allclose(data.qfrc_passive[at.q_dot], data.qfrc_bias[at.q_dot], atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", NOISE)
+@pytest.mark.parametrize("frame", ["offset", "pose"])
+def test_derivatives_are_those_of_finite_differences(kind: Kind, frame: str) -> None:
+    """Catches a missing term of the implicit derivative, for every unknown and every measurement."""
+    model = model_of(log_of(kind, 1, count=3, sides=True), payload="link7", frame=frame)
+    unknowns = model.start_with(0.03)
+    unknowns += 0.01 * model.scale * np.random.default_rng(2).standard_normal(len(unknowns))
+    turn = model.unknowns.slices["rotation"]
+    unknowns[turn] = 0.0  # its derivative is that of a first turn
+    steps = np.diag(1e-5 * model.scale)
+    numeric = [(model.predicted(unknowns + s)[0] - model.predicted(unknowns - s)[0]) / 2e-5 for s in steps]
+    gradient = model.predicted(unknowns)[1] * model.scale
+    np.testing.assert_allclose(gradient, np.stack(numeric, axis=-1), atol=2e-6 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("kind", ["end_effector", "link_encoders", "imu", "torques"])
+@pytest.mark.parametrize("friction", [0.0, 1.0])
+def test_exact_poses_give_the_truth(kind: Kind, friction: float) -> None:
+    """Catches signs, frames and offsets: without noise the truth is what is left."""
+    fit = fit_arm(model_of(log_of(kind, 3, noise=0.0, friction=friction, sides=True)))
+    seen = slice(1, 6) if kind == "imu" else LOADED  # the marker's tilt does not depend on how it is turned upright
+    np.testing.assert_allclose(errors(fit)[seen], 0.0, atol=2e-4)
+    np.testing.assert_allclose(fit.estimate("friction")[0][seen], friction * FRICTION[seen], atol=2e-3)
+    if kind != "imu":
+        np.testing.assert_allclose(fit.estimate("offset")[0][LOADED], OFFSET[LOADED], atol=2e-5)
+
+
+def test_a_tracker_that_stands_anywhere_is_found() -> None:
+    """Catches a frame whose directions are taken for the model's, and one whose shift is not sought with them."""
+    log = log_of("end_effector", 4, noise=0.0)
+    turned = TURN.apply(log.measured) + np.array([3.0, 0.0, -1.0])
+    fit = fit_arm(model_of(replace(log, measured=turned), frame="pose"))
+    np.testing.assert_allclose(errors(fit)[LOADED], 0.0, atol=2e-4)
+
+
+def test_payload_is_found_with_the_stiffness() -> None:
+    """Catches a payload in the wrong place, and one that is taken for soft joints."""
+    spec = mujoco.MjSpec.from_file(str(FOLDER / "arm.xml"))
+    spec.body("link7").mass -= 0.9  # the log's arm carries it, this one does not
+    ipos = np.array(spec.body("link7").ipos)
+    place = (3.6 * ipos - 2.7 * ipos) / 0.9
+    spec.body("link7").add_site(name="weight", pos=place)
+    log = log_of("end_effector", 5, count=60)
+    arm = StaticArm(spec.compile(), JOINTS, "marker", "weight")
+    fit = fit_arm(PoseModel(arm, log, Unknowns.of(log, JOINTS, "offset", payload=True)))
+    mass, half = fit.estimate("payload")
+    assert abs(mass[0] - 0.9) < half[0] < 0.3
+    compliance, width = fit.estimate("compliance")
+    assert (np.abs(compliance - 1.0 / K) < 1.5 * width)[LOADED].all()
+
+
+def test_intervals_hold_the_truth_and_are_no_wider_than_they_must_be() -> None:
+    """Catches an interval of the prior, of half the width, or of noise that friction is not part of."""
+    runs, hits, widths, found = 16, np.zeros(7), [], []
+    for seed in range(runs):
+        fit = fit_arm(model_of(log_of("end_effector", 100 + seed, friction=0.3)))
+        compliance, half = fit.estimate("compliance")
+        hits += np.abs(compliance - 1.0 / K) <= half
+        widths.append(half * K)
+        found.append(compliance * K)
+    assert hits[LOADED].mean() >= 0.9 * runs
+    assert (hits >= 0.75 * runs).all()
+    ratio = np.mean(widths, axis=0)[LOADED] / (2.0 * np.std(found, axis=0)[LOADED])
+    assert 0.8 < np.median(ratio) < 1.5
+
+
+def test_target_of_forty_poses_and_a_tracker_to_three_tenths_of_a_millimetre(tmp_path: Path) -> None:
+    """Catches K beyond 3 % of a joint that is told apart, and a correction that leaves a fifth of the sag."""
+    fit = fit_arm(model_of(log_of("end_effector", 6)))
+    result = described(fit, within=0.03, assumed=None)
+    told = np.array([not joint.reason for joint in result.joints])
+    assert told.tolist() == [False, True, True, True, False, True, False]
+    found = np.array([joint.stiffness_nm_per_rad for joint in result.joints])
+    assert (np.abs(found / K - 1.0)[told] < 0.03).all()
+    result.save(tmp_path)
+    stiffness = parse_yaml((tmp_path / "joints.yaml").read_text())
+    compensator = PositionCompensator.from_model(ARM, stiffness)
+    wanted = 0.8 * poses(40, np.random.default_rng(7))
+    none, where = np.zeros_like(wanted), lambda q: shown("end_effector", q, np.zeros_like(q))
+    corrected = np.array([compensator.command(row) for row in wanted])
+    before, after = (
+        np.sqrt(np.mean(np.sum((where(equilibria(command, none)) - where(wanted)) ** 2, axis=1)))
+        for command in (wanted, corrected)
+    )
+    assert before > 0.005
+    assert after < 0.2 * before
+
+
+def test_joints_that_poses_do_not_tell_apart_are_named_with_the_reason() -> None:
+    """Catches a number for a joint that carries nothing, that the sensor does not show, or that has a twin."""
+    why = {joint.joint: joint for joint in described(fit_arm(model_of(log_of("end_effector", 8))), 0.03, 700.0).joints}
+    assert why["base_yaw"].reason == "gravity does not load it in these poses"
+    assert (why["base_yaw"].source, why["base_yaw"].stiffness_nm_per_rad) == ("assumed", 700.0)
+    assert why["base_yaw"].stiffness_high_nm_per_rad is None
+    assert "small beside the noise" in why["wrist_roll"].reason
+    log = log_of("link_encoders", 8)
+    half = replace(log, columns=JOINTS[:-1], measured=log.measured[:, :-1])
+    assert described(fit_arm(model_of(half)), 0.03, None).joints[-1].reason == "the measurement does not show its angle"
+
+
+def test_joints_that_move_alike_are_named_together() -> None:
+    """Catches twins that are told apart by the prior: elbow and wrist of a planar arm that only turns its shoulder."""
+    xml = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" axis="0 1 0"/>
+      <inertial mass="1" pos="0.2 0 0" diaginertia="0.01 0.01 0.01"/>
+      <body><joint name="b" axis="0 1 0"/><inertial mass="1" pos="0.3 0 0" diaginertia="0.01 0.01 0.01"/>
+      <body name="tip" pos="0.4 0 0"><inertial mass="0.1" pos="0 0 0" diaginertia="1e-4 1e-4 1e-4"/></body>
+      </body></body></worldbody></mujoco>"""
+    model, generator = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(9)
+    arm = StaticArm(model, ("a", "b"), "tip")
+    theta = np.stack([generator.uniform(-1.5, 1.5, 30), np.zeros(30)], axis=-1)
+    angle = theta.sum(axis=-1) - arm.torque(theta) @ [1e-3, 2e-3]
+    measured = 0.4 * np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], -1) + generator.normal(0, 1e-4, (30, 3))
+    log = PoseLog(("a", "b"), theta, "end_effector", ("x", "y", "z"), measured)
+    fit = fit_arm(PoseModel(arm, log, Unknowns.of(log, ("a", "b"), "known", payload=False)))
+    reasons = [joint.reason for joint in described(fit, 0.03, 1000.0).joints]
+    assert reasons == ["these poses do not separate it from b", "these poses do not separate it from a"]
+
+
+def test_planned_poses_tell_more_than_random_ones_and_are_free() -> None:
+    """Catches a plan that is no better than chance, poses beyond the ranges, and poses in which the arm touches."""
+    log = log_of("end_effector", 10, sides=True)
+    fit = fit_arm(model_of(log))
+    candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(11))
+    plan = plan_further(fit, candidates, 10)
+    own = replace(fit.model, log=candidates)
+    own.__dict__["scale"] = fit.model.scale
+    rows, _ = information_of(own, fit.unknowns, fit.spread)
+    drawn = [np.random.default_rng(seed).choice(len(rows), 10, replace=False) for seed in range(20)]
+
+    def region(information: Array) -> float:
+        """Log of the volume of the confidence region of the compliances, up to a constant."""
+        return 0.5 * float(np.linalg.slogdet(np.linalg.inv(information)[:7, :7])[1])
+
+    random = [region(fit.information + np.einsum("npi,npj->ij", rows[d], rows[d])) for d in drawn]
+    assert region(plan.information) < min(random) - 0.2
+    data = mujoco.MjData(ARM)
+    for theta in plan.theta:
+        data.qpos[:] = theta
+        mujoco.mj_forward(ARM, data)
+        assert data.ncon == 0
+    assert ((plan.theta > ARM.jnt_range[:, 0]) & (plan.theta < ARM.jnt_range[:, 1])).all()
+    assert len(np.unique(plan.theta, axis=0)) == 10
+    assert plan.direction is not None
+    assert set(np.unique(plan.direction)) == {-1.0, 1.0}
+
+
+@pytest.mark.parametrize("kind", ["end_effector", "imu"])
+def test_plan_says_in_advance_what_its_poses_then_tell(kind: Kind) -> None:
+    """Catches an information in other units, or one that leaves the log out."""
+    log = log_of(kind, 12)
+    fit = fit_arm(model_of(log))
+    candidates = candidate_poses(fit.model.arm, ARM, log, np.random.default_rng(13))
+    plan = plan_further(fit, candidates, 40)
+    expected = [j.planned_half_width for j in described(fit, 0.03, None, plan.information).joints]
+    further = log_of(kind, 14, theta=plan.theta)
+    both = replace(
+        log,
+        theta=np.concatenate([log.theta, further.theta]),
+        measured=np.concatenate([log.measured, further.measured]),
+    )
+    then = [joint.half_width for joint in described(fit_arm(model_of(both)), 0.03, None).joints]
+    np.testing.assert_allclose(then[1:], np.array(expected, dtype=float)[1:], rtol=0.35)
+
+
+@pytest.mark.parametrize("kind", ["end_effector", "link_encoders"])
+def test_figure_shows_the_deflections_of_the_springs(kind: Kind) -> None:
+    """Catches deflections in another sign or unit, and residuals that are taken away in place of added."""
+    log = log_of(kind, 17)
+    exact = equilibria(log.theta - OFFSET, np.zeros_like(log.theta))
+    fit = fit_arm(model_of(log))
+    predicted, measured = deflections(fit)
+    true = (log.theta - OFFSET - exact)[:, LOADED]
+    np.testing.assert_allclose(predicted[:, LOADED], true, atol=3e-3)
+    assert np.std(predicted[:, LOADED] - true) < 1e-3
+    if kind == "link_encoders":
+        direct = log.theta - fit.estimate("offset")[0] - log.measured
+        np.testing.assert_allclose(measured[:, LOADED], direct[:, LOADED], atol=1e-4)
+
+
+# From here on the command, its files, and what it refuses.
+
+EXAMPLE = FOLDER / "poses.csv"
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*arguments: str) -> None:
+    """The command on the arm of the docs."""
+    main(["identify", "--robot", str(FOLDER / "arm.xml"), "--end-effector", "marker", *arguments])
+
+
+def test_command_on_the_example_writes_what_the_compensator_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches files that are missing or that nothing reads, and an example log that no longer fits its arm."""
+    run("--log", str(EXAMPLE), "--plan", "5", "--output", "found", "--assume", "1500")
+    said = capsys.readouterr().out
+    assert "base_yaw; gravity does not load it" in said
+    names = {path.name for path in Path("found").iterdir()}
+    assert {"identification.json", "joints.yaml", "identification.png", "plan.csv"} <= names
+    stiffness = parse_yaml(Path("found/joints.yaml").read_text())
+    assert stiffness["base_yaw"] == {"stiffness": 1500.0}
+    np.testing.assert_allclose([own["stiffness"] for own in stiffness.values()][LOADED], K[LOADED], rtol=0.12)
+    assert PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml").joints == JOINTS
+    rows = list(csv.reader(Path("found/plan.csv").read_text().splitlines()))
+    assert len(rows) == 6
+    assert rows[0][0] == "theta.base_yaw [rad]"
+
+
+def test_first_poses_are_planned_without_a_log(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a plan that needs what it is made for, and one that promises a joint that gravity does not load."""
+    run("--plan", "8", "--measured-by", "end_effector", "--output", "plan")
+    assert "base_yaw" in capsys.readouterr().out
+    assert len(Path("plan/plan.csv").read_text().splitlines()) == 9
+
+
+def test_example_log_is_that_of_its_script(tmp_path: Path) -> None:
+    """Catches an arm or a script that was changed without the log."""
+    log = read_log(EXAMPLE, RANGES)
+    assert log.direction is not None
+    theta = log.theta - OFFSET
+    load = FRICTION * log.direction
+    markers = shown("end_effector", equilibria(theta, load), load)
+    assert np.std(log.measured - markers) == pytest.approx(3e-4, rel=0.2)
+
+
+def test_samples_of_one_pose_count_once(tmp_path: Path) -> None:
+    """Catches intervals that shrink because a sensor was written down more often, and poses that are lost."""
+    head, rows = table()
+    several = [row for row in rows for _ in range(5)]
+    for number, row in enumerate(several):
+        several[number] = [str(float(row[0]) + 1e-5 * (number % 5 - 2)), *row[1:]]
+    with Path("several.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([head, *several])
+    once, often = read_log(EXAMPLE, RANGES), read_log(Path("several.csv"), RANGES)
+    np.testing.assert_allclose(often.theta, once.theta, atol=1e-12)
+    np.testing.assert_allclose(often.measured, once.measured, atol=1e-12)
+    np.testing.assert_array_equal(often.direction, once.direction)
+
+
+def table() -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the example."""
+    head, *rows = csv.reader(EXAMPLE.read_text().splitlines())
+    return head, rows
+
+
+def changed(column: str, value: Any, name: str | None = None, pose: int | None = None) -> list[list[str]]:
+    """The example with a column renamed, or with values that a function or a text replaces."""
+    head, rows = table()
+    at = next(i for i, own in enumerate(head) if own.startswith(column))
+    for number, row in enumerate(rows):
+        if pose in (None, number):
+            row[at] = value(row[at]) if callable(value) else value
+    head[at] = head[at] if name is None else name
+    return [head, *rows]
+
+
+def kept(but: str) -> list[list[str]]:
+    """The example without columns of a quantity."""
+    head, rows = table()
+    at = [i for i, own in enumerate(head) if not own.startswith(but)]
+    return [[row[i] for i in at] for row in (head, *rows)]
+
+
+def alike() -> list[list[str]]:
+    head, rows = table()
+    return [head, *[rows[0]] * 40]
+
+
+def both_kinds() -> list[list[str]]:
+    head, rows = table()
+    return [[*head, "imu.roll [rad]", "imu.pitch [rad]"], *[[*row, "0.1", "0.2"] for row in rows]]
+
+
+def in_degrees() -> list[list[str]]:
+    head, rows = table()
+    at = [i for i, own in enumerate(head) if own.startswith("theta")]
+    return [head, *[[str(math.degrees(float(v))) if i in at else v for i, v in enumerate(row)] for row in rows]]
+
+
+def same(value: str) -> str:
+    return value
+
+
+BAD: Mapping[str, tuple[Any, list[str]]] = {
+    "other joint": (lambda: changed("theta.elbow", same, "theta.elbo [rad]"), ["'elbo'", "Did you mean 'elbow'"]),
+    "few poses": (lambda: [*table()[:1], *table()[1][:9]], ["24 unknowns", "at least 11 poses", "has 9", "--joints"]),
+    "alike": (alike, ["all 40 poses", "alike", "--plan"]),
+    "nan": (lambda: changed("theta.elbow", "nan", pose=4), ["pose 5", "theta.elbow", "finite", "'nan'"]),
+    "text": (lambda: changed("end_effector.y", "far", pose=0), ["pose 1", "end_effector.y", "[m]", "'far'"]),
+    "degrees": (in_degrees, ["theta.", "beyond", "look like degrees", "radians"]),
+    "unit": (lambda: changed("theta.elbow", same, "theta.elbow [deg]"), ["must be [rad]", "[deg]", "convert"]),
+    "millimetres": (lambda: changed("end_effector.x", same, "end_effector.x [mm]"), ["must be [m]", "[mm]"]),
+    "no measurement": (lambda: kept("end_effector"), ["needs a measurement", "q.JOINT", "end_effector", "torque"]),
+    "no encoders": (lambda: kept("theta"), ["no motor encoders", "theta.JOINT"]),
+    "both kinds": (both_kinds, ["end_effector, imu", "--measured-by"]),
+    "one axis": (lambda: kept("end_effector.z"), ["end_effector needs exactly", "x, y, z", "got x, y"]),
+    "column": (lambda: changed("end_effector.x", same, "tool_x"), ["'tool_x'", "theta.JOINT"]),
+    "twice": (lambda: changed("theta.elbow", same, "theta.wrist_roll"), ["theta.wrist_roll twice"]),
+    "direction": (lambda: changed("direction.elbow", "0.5", pose=2), ["1 (approached from below)", "0.5"]),
+    "short line": (lambda: [*table()[:1], ["1", "2"]], ["pose 1", "17 values", "got 2"]),
+    "empty": (lambda: [], ["is empty"]),
+    "header alone": (lambda: list(table()[:1]), ["1 to 10000 poses", "has 0"]),
+    "metres": (
+        lambda: changed("end_effector.x", lambda v: str(1e3 * float(v))), ["end_effector", "spread over", "millimetres"]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_log_is_one_sentence_that_says_what_to_do(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches tracebacks, fits of nonsense, and folders left behind."""
+    content, words = BAD[case]
+    with Path("bad.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(content())
+    with pytest.raises(SystemExit) as ended:
+        run("--log", "bad.csv")
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert [word for word in words if word not in said] == []
+    assert "Traceback" not in said
+    assert not Path("runs").exists()
+
+
+REFUSED: Mapping[str, tuple[list[str], list[str]]] = {
+    "missing log": (["--log", "none.csv"], ["no log at none.csv"]),
+    "neither": ([], ["--log", "--plan", "--measured-by"]),
+    "joint": (["--log", str(EXAMPLE), "--joints", "wrst_*"], ["'wrst_*'", "wrist_roll"]),
+    "payload": (["--log", str(EXAMPLE), "--payload", "hand"], ["'hand'", "link7", "marker"]),
+    "kind": (["--log", str(EXAMPLE), "--measured-by", "imu"], ["none of imu"]),
+    "within": (["--log", str(EXAMPLE), "--within", "0"], ["--within must be", "> 0"]),
+    "plan": (["--log", str(EXAMPLE), "--plan", "201"], ["--plan must be", "<= 200"]),
+    "testbed": (["--log", str(EXAMPLE), "--scenario", "soft"], ["--scenario", "testbed"]),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_wrong_option_says_what_and_which_choices(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches options that are ignored, and names that are not listed."""
+    arguments, words = REFUSED[case]
+    with pytest.raises(SystemExit) as ended:
+        run(*arguments)
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert [word for word in words if word not in said] == []
+    assert not Path("runs").exists()
+
+
+def test_a_log_that_no_springs_explain_is_refused() -> None:
+    """Catches an endless fit, and a stiffness from measurements of another arm."""
+    log = log_of("link_encoders", 15)
+    with pytest.raises((ElasticError, ConfigurationError), match=r"signs|rigid|springs|tell no stiffness"):
+        described(fit_arm(model_of(replace(log, measured=2.0 * log.theta - log.measured))), 0.03, None)
+
+
+def test_chosen_joints_alone_are_sought() -> None:
+    """Catches a pattern that is ignored: all other joints stay rigid."""
+    stiff = np.where(np.isin(JOINTS, ["elbow", "wrist_pitch"]), K, 1e12)
+    theta = poses(40, np.random.default_rng(16))
+    data, rows = mujoco.MjData(ARM), []
+
+    def imbalance(q: Array, own: Array) -> Array:
+        data.qpos[:] = q
+        mujoco.mj_forward(ARM, data)
+        return own - q - data.qfrc_bias / stiff
+
+    for own in theta:
+        rows.append(root(imbalance, own, (own,), tol=1e-13).x)
+    measured = shown("end_effector", np.array(rows), np.zeros_like(theta))
+    log = PoseLog(JOINTS, theta, "end_effector", ("x", "y", "z"), measured)
+    fit = fit_arm(model_of(log, elastic=("elbow", "wrist_pitch")))
+    np.testing.assert_allclose(1.0 / fit.estimate("compliance")[0], [900.0, 250.0], rtol=1e-4)

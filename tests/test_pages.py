@@ -1,0 +1,105 @@
+"""README and docs: short, in plain English, and true where they speak of the code."""
+
+import contextlib
+import io
+import re
+import tomllib
+from functools import reduce
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.prose import sentences, words
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PLAIN = ["README.md", *(f"docs/{name}.md" for name in (
+    "index", "concepts", "equations", "commands", "testing", "limits", "policies", "leaderboard", "trials",
+    "arms", "comparison", "iterative", "options", "testbed", "training",
+))]  # fmt: skip
+"""Pages that are held to plain English; a page joins when it has been rewritten."""
+MOST_WORDS, LONGEST = 900, 25
+
+
+def prose_words(text: str) -> int:
+    """Words outside code."""
+    lines = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL).splitlines()
+    return sum(len(line.split()) for line in lines if not line.startswith("    "))
+
+
+def test_the_readme_is_one_screen_and_shows_python_early() -> None:
+    """Catches a README that grows again, and a console dump in it."""
+    assert prose_words(README) <= MOST_WORDS
+    assert README[: README.index("```python")].count("\n") < 60
+    assert all(block.count("\n") <= 20 for block in re.findall(r"```.*?```", README, flags=re.DOTALL))
+
+
+def test_the_python_of_the_readme_prints_what_it_says() -> None:
+    """Catches a snippet that no longer runs, and figures beside it that are old."""
+    code, printed = (re.findall(rf"```{kind}\n(.*?)```", README, flags=re.DOTALL)[0] for kind in ("python", "text"))
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        exec(code, {})
+    assert output.getvalue() == printed
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_sentences_are_short(name: str) -> None:
+    """Catches a sentence that a tired reader must read twice."""
+    found = sentences((ROOT / name).read_text(encoding="utf-8"))
+    assert [sentence for sentence in found if words(sentence) > LONGEST] == []
+    assert np.percentile([words(sentence) for sentence in found], 90) < LONGEST
+
+
+def test_sentences_are_found() -> None:
+    """Catches a measure that sees no sentence, or takes code and tables for prose."""
+    prose = "One two three. Four `a b` six\nseven [eight](x.md).\n\n* Nine, in Eq. 9 of it."
+    found = sentences(f"# Title\n\n{prose}\n\n| a | b |\n\n    code\n")
+    assert [words(sentence) for sentence in found] == [3, 5, 6]
+
+
+def test_every_equation_of_the_paper_has_a_function() -> None:
+    """Catches a function that was renamed, and an equation that nobody implements."""
+    text = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \|.*\| `([\w.]+)` \|$", text, flags=re.MULTILINE)
+    assert [int(number) for number, _ in rows] == list(range(1, 13))
+    named = re.findall(r"`((?:elastic_env|baselines|train)(?:\.\w+)+)`", text)
+    concepts = (ROOT / "docs" / "concepts.md").read_text(encoding="utf-8")
+    named += re.findall(r"`((?:elastic_env|baselines|train)(?:\.\w+){2,})`", concepts)
+    assert {function for _, function in rows} <= set(named)
+    assert [name for name in named if not callable(_resolved(name))] == []
+
+
+def _resolved(name: str) -> object:
+    parts = name.split(".")
+    for at in range(len(parts) - 1, 0, -1):
+        with contextlib.suppress(ModuleNotFoundError):
+            module = import_module(".".join(parts[:at]))
+            return reduce(lambda owner, part: getattr(owner, part, None), parts[at:], module)
+    return None
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))])
+def test_links_lead_somewhere(page: Path) -> None:
+    """Catches a page or a heading that was renamed; pages that the site generates are left to its own build."""
+    for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        path, _, heading = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        if "generated" in file.parts:
+            continue
+        assert file.exists(), f"{page.name}: {target}"
+        if heading:
+            text = file.read_text(encoding="utf-8")
+            titles = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+            assert heading in {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}, target
+
+
+def test_the_citation_agrees_with_the_package() -> None:
+    """Catches a version or a licence that was changed in one place alone."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert (citation["title"], citation["version"]) == (project["name"], project["version"])
+    assert citation["license"] == project["license"]

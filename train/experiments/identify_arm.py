@@ -1,0 +1,274 @@
+"""`elastic identify --robot`: stiffness of an arm from a log of static poses, and poses that would tell more."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Self
+
+import mujoco
+import numpy as np
+from pydantic import model_validator
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from baselines.identification.arm_fit import USUAL_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
+from baselines.identification.arm_result import ArmIdentification, JointStiffness, described
+from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
+from baselines.identification.pose_model import Frame, PoseModel, Unknowns
+from baselines.identification.pose_plan import (
+    MOST_PLANNED,
+    PosePlan,
+    candidate_poses,
+    empty_log,
+    plan_further,
+    plan_poses,
+)
+from baselines.identification.static_arm import StaticArm, hinges_of
+from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
+from elastic_env.core.errors import unknown_name
+from elastic_env.joint.model_file import compiled_model
+from train.figures import plots
+from train.figures.arm_plots import draw_arm_identification
+from train.runs.folders import run_folder
+from train.runs.workers import show_progress
+
+_USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
+"""Noise of usual sensors, which a plan without a log assumes [m], [rad], [N·m]."""
+_FAR_BEYOND = 10.0
+"""Ratio of residuals and usual noise from which on the output warns."""
+_ASSUMED_DEFLECTION_RAD = 0.01
+"""Deflection under the largest gravity torque that a plan without a log assumes."""
+
+
+class IdentifyArmConfig(Model):
+    """What `elastic identify --robot` does."""
+
+    robot: Locator
+    """Rigid model of the arm, MJCF or URDF."""
+    log: Locator | None = None
+    """CSV file of static poses; None to plan the first ones."""
+    joints: tuple[Title, ...] = ()
+    """Names or patterns of the joints whose stiffness is sought; empty for all in the log."""
+    end_effector: Title | None = None
+    """Site or body that is measured; None for the outermost body."""
+    payload: Title | None = None
+    """Body or site that carries a payload of unknown mass."""
+    frame: Frame = "offset"
+    """What is known of the measurement's frame."""
+    measured_by: Kind | None = None
+    """Measurement to use."""
+    within: float = quantity("1", 0.03, gt=0, lt=1, description="half-width of 1/K up to which a joint is told apart")
+    assume: float | None = quantity("N·m/rad", None, gt=0, description="K of joints that are not identified")
+    plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED, description="number of poses to propose")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the poses from which the plan chooses")
+
+    @model_validator(mode="after")
+    def _something_to_do(self) -> Self:
+        if self.log is None and (not self.plan or self.measured_by is None):
+            raise ValueError(
+                "give the CSV file of static poses by --log, or plan the first poses by --plan 40 --measured-by "
+                "end_effector (or link_encoders, imu, torques)"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """An arm, its log, and the joints that are sought."""
+
+    arm: StaticArm
+    log: PoseLog
+    elastic: tuple[str, ...]
+
+    def model(self, config: IdentifyArmConfig, log: PoseLog | None = None) -> PoseModel:
+        """The poses of a log as a function of the unknowns."""
+        own = self.log if log is None else log
+        return PoseModel(self.arm, own, Unknowns.of(own, self.elastic, config.frame, config.payload is not None))
+
+
+def run_arm_identification(
+    config: IdentifyArmConfig, console: Console, output: Path | None = None
+) -> ArmIdentification | None:
+    """Identify an arm, write `identification.json`, `joints.yaml` and the figure, print the result; or plan.
+
+    Args:
+        config: What to do.
+        console: Where progress and table go.
+        output: Folder for the results; default runs/identify, numbered if taken.
+
+    Returns:
+        The result; None for a plan without a log.
+
+    Raises:
+        ConfigurationError: Model, log or a name cannot be used.
+        ResultsExistError: The output folder holds results.
+    """
+    plots.require_matplotlib()
+    setting = _setting(config, compiled_model(config.robot), console)
+    with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
+        if config.log is None:
+            _plan_first(config, setting, folder, console)
+            return None
+        with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
+            fit = fit_arm(setting.model(config), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
+        plan = plan_further(fit, _candidates(config, setting, console), config.plan) if config.plan else None
+        result = described(fit, config.within, config.assume, None if plan is None else plan.information)
+        files = result.save(folder)
+        files.append(draw_arm_identification(fit, result, folder / "identification.png"))
+        files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
+    console.print(result_table(result))
+    for line in [summed_up(fit), *remarks(result, fit)]:
+        console.print(escape(line), highlight=False)
+    for path in files:
+        console.print(f"wrote {path}", soft_wrap=True, markup=False)
+    return result
+
+
+def result_table(result: ArmIdentification) -> Table:
+    """An identification as a table."""
+    has_friction, has_plan = not result.friction_is_noise, result.joints[0].planned_half_width is not None
+    title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
+    table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    table.add_column("joint", no_wrap=True)
+    heads = ["K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction]
+    for head in [*heads, "o [mrad]"]:
+        table.add_column(escape(head), justify="right", no_wrap=True)
+    for joint in result.joints:
+        cells = [*_stiffness_cells(joint), *[_percent(joint.planned_half_width)] * has_plan]
+        cells += [_number(joint.friction_nm)] * has_friction + [_number(1e3 * joint.offset_rad)]
+        table.add_row(escape(joint.joint), *cells)
+    return table
+
+
+def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
+    """What the table does not say: the payload, joints that are not told apart, and poses that do not fit."""
+    lines = []
+    if result.payload_kg is not None and result.payload_half_width_kg is not None:
+        lines.append(f"payload {result.payload_kg:.3f} ± {result.payload_half_width_kg:.3f} kg")
+    for why in dict.fromkeys(joint.reason for joint in result.joints if joint.reason):
+        names = ", ".join(joint.joint for joint in result.joints if joint.reason == why)
+        lines.append(f"not told apart to {100 * result.within:g} %: {names}; {why}")
+    if assumed := [joint for joint in result.joints if joint.source == "assumed"]:
+        names = ", ".join(joint.joint for joint in assumed)
+        lines.append(
+            f"joints.yaml assumes {assumed[0].stiffness_nm_per_rad:.4g} N·m/rad for {names}; --assume changes it"
+        )
+    usual = _USUAL_NOISE[result.measurement]
+    if result.residual_spread > _FAR_BEYOND * usual:
+        lines.append(
+            f"the residuals are far beyond the usual noise of {in_unit(usual, result.measurement)}: look for other "
+            "elastic joints, another frame (--frame) or body (--end-effector), friction, and errors of the model"
+        )
+    if result.outlying_poses:
+        lines.append(f"poses that do not fit the others: {', '.join(map(str, result.outlying_poses))}; check them")
+    held = [joint for joint in hinges_of(fit.model.arm.model) if joint not in fit.model.log.joints]
+    if held:
+        lines.append(f"not in the log, and taken as held where the model has them: {', '.join(held)}")
+    if any(joint.reason for joint in result.joints) and result.joints[0].planned_half_width is None:
+        lines.append("--plan 20 proposes poses that tell more")
+    return lines + _beyond_any_plan(result.joints)
+
+
+def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
+    """Joints for which no proposed pose helps."""
+    helpless = [j.joint for j in joints if j.planned_half_width is not None and j.reason and j.planned_half_width > 1.0]
+    if not helpless:
+        return []
+    return [
+        f"no proposed pose tells {', '.join(helpless)}: gravity must load the joint, and the measurement must show it; "
+        "tilt the base, hang on a weight, or measure it by hand"
+    ]
+
+
+def _candidates(config: IdentifyArmConfig, setting: _Setting, console: Console) -> PoseLog:
+    """Poses to choose from; says where contacts of the arm are not known."""
+    shapes = shaped_model(config.robot)
+    if not (shapes.geom_contype.any() or shapes.geom_conaffinity.any()):
+        console.print("the model has no shapes that MuJoCo can read: check the proposed poses for contacts yourself")
+    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(config.seed))
+
+
+def shaped_model(path: str) -> mujoco.MjModel:
+    """The model with its collision shapes; that of `compiled_model` where MuJoCo cannot read the shapes."""
+    try:
+        shaped = mujoco.MjSpec.from_file(path).compile()
+    except ValueError:
+        return compiled_model(path)
+    return shaped if set(hinges_of(compiled_model(path))) <= set(hinges_of(shaped)) else compiled_model(path)
+
+
+def _setting(config: IdentifyArmConfig, model: mujoco.MjModel, console: Console) -> _Setting:
+    """Read the log, and look everything up that is named."""
+    hinges = hinges_of(model)
+    ranges = {name: _range(model, name) for name in hinges}
+    log = None if config.log is None else read_log(Path(config.log), ranges, config.measured_by)
+    arm = StaticArm(model, hinges if log is None else log.joints, config.end_effector, config.payload)
+    arm.require_gravity()
+    if log is None:
+        log = empty_log(arm, config.measured_by or "end_effector")
+    if config.end_effector is None and log.kind in ("end_effector", "imu"):
+        console.print(f"measured is taken to be {arm.end_effector!r}; --end-effector names another site or body")
+    setting = _Setting(arm, log, _sought(config.joints, log.joints))
+    if config.log is not None:
+        require_poses(setting.model(config))
+    return setting
+
+
+def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
+    low, high = model.joint(joint).range if model.jnt_limited[model.joint(joint).id] else (-np.inf, np.inf)
+    return float(low), float(high)
+
+
+def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+    """Joints that a name or pattern fits, in the order of the log."""
+    for pattern in patterns:
+        if not any(fnmatchcase(joint, pattern) for joint in joints):
+            raise unknown_name("joint or pattern of the log's joints", pattern, joints)
+    return tuple(joint for joint in joints if not patterns or any(fnmatchcase(joint, p) for p in patterns))
+
+
+def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, console: Console) -> None:
+    """Plan without a log: with usual noise, and deflections of a usual size."""
+    candidates = _candidates(config, setting, console)
+    model, noise = setting.model(config, candidates), _USUAL_NOISE[setting.log.kind]
+    start = model.start_with(_ASSUMED_DEFLECTION_RAD)
+    plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, config.plan)
+    own = model.unknowns.slices["compliance"]
+    half = 1.96 * np.sqrt(np.diag(np.linalg.inv(plan.information))[own]) * model.scale[own] / start[own]
+    table = Table(title=f"{len(plan.theta)} proposed poses")
+    table.add_column("joint")
+    table.add_column("expected ± of K", justify="right")
+    for joint, width in zip(setting.elastic, half, strict=True):
+        table.add_row(escape(joint), _percent(float(width)))
+    console.print(table)
+    console.print(
+        f"expected for noise of {in_unit(noise, setting.log.kind)} and {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad of "
+        "deflection under the largest gravity torque of each joint; half the deflection doubles it",
+        highlight=False,
+    )
+    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True, markup=False)
+
+
+def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
+    columns = {f"theta.{joint}": plan.theta[:, i] for i, joint in enumerate(arm.joints)}
+    if plan.direction is not None:
+        columns |= {f"direction.{joint}": plan.direction[:, i] for i, joint in enumerate(arm.joints)}
+    return write_poses(path, columns)
+
+
+def _stiffness_cells(joint: JointStiffness) -> list[str]:
+    low, high = joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad
+    if joint.source == "assumed" or low is None or high is None:
+        return ["-", "-", _percent(joint.half_width)]
+    return [f"{joint.stiffness_nm_per_rad:.4g}", f"{low:.4g} to {high:.4g}", _percent(joint.half_width)]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _percent(half: float | None) -> str:
+    return "> 100 %" if half is None or half > 1.0 else f"{100 * half:.2g} %"

@@ -1,0 +1,86 @@
+"""Figure of an arm's identification: measured and predicted deflections, joint by joint, and the residuals."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.identification.arm_fit import ArmFit
+from baselines.identification.arm_result import ArmIdentification
+from baselines.identification.pose_model import measurement_unit
+from elastic_env.core.signals import Array
+from train.figures.plots import MRAD, require_matplotlib, save
+
+_COLUMNS = 4
+_LEAST_LEVER = 0.1  # of the largest: poses that show a joint less are left out of its panel
+_LEAST_SEEN = 0.01  # of the largest of all joints
+_MOST_NAMED = 3  # columns of a measurement that a legend names
+_DOTS, _LINE = "#2a6f97", "#888888"
+
+
+def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
+    """A panel per joint with measured against predicted deflection, and one with the residual of every pose.
+
+    Measured is the predicted deflection and the part of the residual that a deflection of this joint alone explains.
+    """
+    plt = require_matplotlib()
+    rows = -(-(len(result.joints) + 1) // _COLUMNS)
+    figure, axes = plt.subplots(rows, _COLUMNS, figsize=(3.1 * _COLUMNS, 2.9 * rows), squeeze=False)
+    panels = list(axes.ravel())
+    predicted, measured = deflections(fit)
+    for axis, joint, x, y in zip(panels, result.joints, predicted.T, measured.T, strict=False):
+        _draw_joint(axis, x, y)
+        axis.set_title(f"{joint.joint}\n{_stiffness(joint)}", fontsize=9)
+    _draw_residuals(panels[len(result.joints)], fit)
+    for axis in panels[len(result.joints) + 1 :]:
+        axis.set_visible(False)
+    figure.supxlabel("predicted deflection θ − q [mrad]", fontsize=10)
+    figure.supylabel("measured deflection [mrad]", fontsize=10)
+    figure.tight_layout()
+    return save(figure, path)
+
+
+def deflections(fit: ArmFit) -> tuple[Array, Array]:
+    """Deflections of the elastic joints, predicted and measured, (N, k) [rad]; nan where a pose does not show one."""
+    model, elastic = fit.model, fit.model.unknowns.elastic
+    compliance, _ = fit.estimate("compliance")
+    predicted = compliance * model.torque(fit.unknowns, fit.q)[:, elastic]
+    # an offset turns a joint as a deflection does, so that its derivative is the lever of the deflection
+    lever = model.predicted(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
+    size = np.sum(lever**2, axis=1)
+    largest = size.max(axis=0)
+    seen = size > np.maximum(_LEAST_LEVER**2 * largest, _LEAST_SEEN**2 * largest.max())
+    along = np.sum(lever * fit.residual[..., None], axis=1)
+    return predicted, np.where(seen, predicted + along / np.where(seen, size, 1.0), np.nan)
+
+
+def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
+    if np.isnan(measured).all():
+        axis.text(0.5, 0.5, "the measurement\ndoes not show it", ha="center", transform=axis.transAxes, fontsize=9)
+        return
+    axis.axline((0.0, 0.0), slope=1.0, color=_LINE, lw=0.9)
+    axis.scatter(MRAD * predicted, MRAD * measured, s=14, color=_DOTS, alpha=0.8, linewidths=0, zorder=3)
+
+
+def _draw_residuals(axis: Any, fit: ArmFit) -> None:
+    unit = measurement_unit(fit.model.log.kind)
+    factor, shown = (1.0, unit) if unit == "N·m" else (1e3, f"m{unit}")
+    poses = np.arange(1, len(fit.residual) + 1)
+    for column, name in zip(fit.residual.T, _names(fit), strict=True):
+        axis.plot(poses, factor * column, ".", ms=4, label=name)
+    axis.axhline(0.0, color=_LINE, lw=0.8)
+    axis.set_title(f"residual [{shown}] by pose\nspread {factor * fit.spread:.3g} {shown}", fontsize=9)
+    if len(_names(fit)) <= _MOST_NAMED:
+        axis.legend(fontsize=7, ncols=3, handletextpad=0.1, columnspacing=0.6, loc="upper right")
+    else:
+        axis.set_xlabel("a colour per joint, in their order", fontsize=8)
+
+
+def _names(fit: ArmFit) -> tuple[str, ...]:
+    return ("tilt 1", "tilt 2") if fit.model.log.kind == "imu" else fit.model.log.columns
+
+
+def _stiffness(joint: Any) -> str:
+    if joint.source == "assumed":
+        return "not told apart"
+    return f"K = {joint.stiffness_nm_per_rad:.4g} N·m/rad ± {100 * joint.half_width:.2g} %"

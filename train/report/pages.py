@@ -1,0 +1,130 @@
+"""Pages of the documentation whose figures come from the results beside them, and from nowhere else.
+
+    python -m train.report.pages          # README.md and docs/*.md from docs/results
+
+A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. The tool
+writes every part anew. A test fails where a page and the results disagree.
+"""
+
+import csv
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from elastic_env.core.errors import ConfigurationError
+from train.evaluate.leaderboard import Standing
+from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard, said
+from train.runs.escaping import markdown_table
+
+PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
+"""Angle error of the pelvis that the paper reports in both gaits [mrad], its Figs. 7 and 8."""
+
+_TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
+_SHORT = ("mixture", "held out")
+_PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results that pages show.
+
+    Attributes:
+        standings: Rows of the leaderboard.
+        walks: Episodes of `elastic demo`, a column of `episodes.csv` by its name.
+    """
+
+    standings: Sequence[Standing]
+    walks: Sequence[Mapping[str, str]]
+
+    @classmethod
+    def read(cls, folder: Path) -> "Results":
+        """From a folder with `leaderboard.csv` and `demo_episodes.csv`.
+
+        Raises:
+            ConfigurationError: A table is missing, or not one of ours.
+        """
+        walks = folder / "demo_episodes.csv"
+        if not walks.is_file():
+            raise ConfigurationError(f"{walks} is missing; copy it from runs/demo/episodes.csv after `elastic demo`")
+        with walks.open(newline="", encoding="utf-8") as file:
+            return cls(read_leaderboard(folder / "leaderboard.csv"), list(csv.DictReader(file)))
+
+
+def walks_beside_the_paper(results: Results) -> str:
+    """Largest roll and pitch of the walks in `nominal` without and with compensation, and those of the paper."""
+    rows = []
+    for row in results.walks:
+        if row["scenario"] == "nominal" and row["policy"] in PAPER_PELVIS and row[_PEAKS[0]]:  # else the testbed's
+            roll, pitch = (f"{1e3 * float(row[name]):.1f}" for name in _PEAKS)
+            rows.append([row["reference"], _TITLES[row["policy"]], roll, pitch, PAPER_PELVIS[row["policy"]]])
+    head = ["step period", "largest error of the pelvis [mrad]", "roll", "pitch", "paper"]
+    return markdown_table(head, ["---"] * 2 + ["---:"] * 3, rows) + "\n"
+
+
+def learning_in_short(results: Results) -> str:
+    """What learning adds in the motion that comes first: over its base, and over the best policy without learning."""
+    first = results.standings[0].reference
+    rows = [
+        [f"{s.policy}, {s.scope}", s.title, said(s.base), said(s.rival)]
+        for s in results.standings
+        if s.training_seeds and s.reference == first and s.scope in _SHORT
+    ]
+    head = ["", f"step period {first}", "(a) over its base", "(b) over the best policy without learning"]
+    return markdown_table(head, ["---"] * 2 + ["---:"] * 2, rows) + "\n"
+
+
+PARTS: Mapping[str, Callable[[Results], str]] = {
+    "leaderboard": lambda results: leaderboard_markdown(results.standings),
+    "what learning adds": lambda results: claims_markdown(results.standings),
+    "learning in short": learning_in_short,
+    "walks beside the paper": walks_beside_the_paper,
+}
+"""Parts of pages by the name of their marks."""
+
+
+def marks(part: str) -> tuple[str, str]:
+    """Lines of a page, between which a part is written."""
+    return f"<!-- {part}: begin -->", f"<!-- {part}: end -->"
+
+
+def has_parts(text: str) -> bool:
+    """Whether a page has a mark of any part."""
+    return any(mark in text for part in PARTS for mark in marks(part))
+
+
+def page_with(text: str, results: Results) -> str:
+    """A page with every part between its marks written anew.
+
+    Raises:
+        ConfigurationError: It has no marks of any part, or not both of a part, each once and in order.
+    """
+    parts = [part for part in PARTS if any(mark in text for mark in marks(part))]
+    for part in parts or PARTS:
+        begin, end = marks(part)
+        if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+            raise ConfigurationError(f"a page for the {part} needs the lines {begin!r} and {end!r}, each once")
+        before, _, rest = text.partition(begin)
+        text = f"{before}{begin}\n\n{PARTS[part](results)}\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+def pages(root: Path) -> list[Path]:
+    """Pages under a checkout that show results."""
+    candidates = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return [page for page in candidates if page.is_file() and has_parts(page.read_text(encoding="utf-8"))]
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the parts of all pages of a checkout: [FOLDER], by default the working directory."""
+    if len(arguments) > 1:
+        raise SystemExit("usage: python -m train.report.pages [CHECKOUT]")
+    root = Path(*arguments)
+    found, results = pages(root), Results.read(root / "docs" / "results")
+    for page in found:
+        page.write_text(page_with(page.read_text(encoding="utf-8"), results), encoding="utf-8")
+    print(f"{len(found)} pages written: {', '.join(str(page.relative_to(root)) for page in found)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
