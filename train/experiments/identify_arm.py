@@ -33,7 +33,7 @@ from elastic_env.joint.model_file import compiled_model
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
 from train.runs.folders import run_folder
-from train.runs.workers import show_progress
+from train.runs.progress import show_progress
 
 _USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
 """Noise of usual sensors, which a plan without a log assumes [m], [rad], [N·m]."""
