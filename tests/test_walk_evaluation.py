@@ -443,7 +443,7 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     reports = {"statistics.csv", "report.html", "report.md"}
     files = {"episodes.csv", "summary.md", "overview.png", f"pelvis_{stem}", f"zmp_{stem}"} | reports
     folder = Path("runs/walks")
-    assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json"}
+    assert {path.name for path in folder.iterdir()} == files | {"config.yaml", "metadata.json", ".lock"}
     printed = capsys.readouterr().out
     assert [name for name in files if f"runs/walks/{name}" not in printed] == []
     assert load_yaml(folder / "config.yaml", CompareConfig) == load_yaml("walks.yaml", CompareConfig)
