@@ -97,7 +97,7 @@ class PositionCompensator:
     ) -> Self:
         """From a file of MJCF or URDF, or from what MuJoCo made of one; further arguments as of the class.
 
-        `stiffness` may be a file, *.yaml, such as the `joints.yaml` of `elastic identify --robot`.
+        `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`.
 
         Raises:
             ConfigurationError: The file or a value cannot be used.
