@@ -13,11 +13,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
-import baselines
 from baselines.residual_env import ResidualWrapper
 from elastic_env import JointRobot
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.runtime.scenario import scenario_names
+from tests.played import metrics_of
 from tests.three_joints import ARM, rigid_arm
 from train.commands.cli import main
 
@@ -38,16 +38,7 @@ def vector(worlds: int, **arguments: Any) -> Any:
 
 def link_error(policy: str, **arguments: Any) -> float:
     """RMS of an episode [rad]."""
-    env = scalar(**arguments)
-    played = baselines.make(policy, env)
-    observation, info = env.reset(seed=0)
-    state, start = None, np.array(True)
-    while "episode_metrics" not in info:
-        action, state = played.predict(observation, state, start)
-        observation, *_, info = env.step(action)
-        start = np.array(False)
-    assert info["termination"] == ""
-    return float(info["episode_metrics"]["link_error_rms_rad"])
+    return float(metrics_of(scalar(**arguments), policy)["link_error_rms_rad"])
 
 
 @pytest.mark.parametrize("scenario", [name for name in scenario_names(walks=False) if name != "imu"])

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 
-import baselines
 from baselines import PositionCompensator
 from baselines.compensation.compensators import GravityCompensator, Motion
 from baselines.compensation.gravity_torque import make_gravity
@@ -14,6 +13,7 @@ from elastic_env import ElasticJoint, JointRobot, Servo
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.runtime.robot_model import RobotModel
+from tests.played import metrics_of
 
 # As an arm: a base that turns, a shoulder with a spring, an elbow, and gravity compensation on two of the bodies.
 ARM = """<mujoco>
@@ -95,16 +95,9 @@ def test_policy_and_live_compensator_agree(integral_gain: float) -> None:
 def errors(policy: str, scenario: str, integral_gain: float, home: Any, reference: dict[str, Any]) -> float:
     """RMS link error of an episode [rad]."""
     env = robot(integral_gain, home).robot.make(scenario=scenario, reference=reference)
-    played = baselines.make(policy, env)
-    observation, info = env.reset(seed=0)
-    state, start = None, np.array(True)
-    while "episode_metrics" not in info:
-        action, state = played.predict(observation, state, start)
-        observation, *_, info = env.step(action)
-        start = np.array(False)
-    assert info["termination"] == ""
-    assert info["episode_metrics"]["clipped_share"] == 0.0
-    return float(info["episode_metrics"]["link_error_rms_rad"])
+    metrics = metrics_of(env, policy)
+    assert metrics["clipped_share"] == 0.0
+    return float(metrics["link_error_rms_rad"])
 
 
 STILL = {"kind": "sine", "amplitude": 1e-9, "duration_s": 0.5, "onset_s": 2.0}
