@@ -19,6 +19,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.dynamics.end_effector import EndEffector
 from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.joint.make_elastic import transformed
@@ -58,6 +59,7 @@ class JointRobot:
         home: Angle about which each joint follows the reference, (n,) [rad]; None for zeros.
         load: Body that carries what the scenario `payload` adds; None for that of the last joint.
         imu: Site of the accelerometer; None for a robot without one.
+        end_effector: Site or body whose place and tilt are scored; None to score the joints alone.
     """
 
     name: str
@@ -66,6 +68,7 @@ class JointRobot:
     home: Sequence[float] | None = None
     load: str | None = None
     imu: str | None = None
+    end_effector: str | None = None
 
     @property
     def id(self) -> str:
@@ -142,10 +145,12 @@ class JointRobot:
             if self.imu is None:
                 raise ConfigurationError(f"{self.name} has no IMU: name its site, JointRobot(..., imu=SITE)")
             add_accelerometer(spec, self.imu)
+        tool = None if self.end_effector is None else EndEffector(true.rigid, list(true_joints), self.end_effector)
         return JointPlant(
             name=self.name, model=spec.compile(), assumed=RobotModel(config.joints, known.compile(), period), true=true,
             static_torque=body.gravity_torque, home=home,
             rest_angle=partial(_rest_angle, stiffness=true.rest_stiffness(config.form), true=true, body=body),
+            end_effector=tool,
         )  # fmt: skip
 
     def _load_body(self) -> str:

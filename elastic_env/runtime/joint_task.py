@@ -18,6 +18,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
 from elastic_env.core.state import Stateful
+from elastic_env.dynamics.end_effector import EndEffector
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.joint.time_step import require_stable
@@ -61,6 +62,10 @@ METRICS_OF_SEVERAL = (
     Metric("servo_error_rms_rad", "servo_error", "rms"),
     *_OF_EVERY_STEP,
 )
+METRICS_OF_END_EFFECTOR = (
+    *(Metric(f"end_effector_error_{s}_m", "end_effector_error", s) for s in ("rms", "peak")),
+    *(Metric(f"end_effector_tilt_{s}_rad", "end_effector_tilt", s) for s in ("rms", "peak")),
+)
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,7 @@ class JointPlant:
         home: Added to the reference of each joint, (n,) [rad].
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
             q = 0 [m]; None where there is no such IMU.
+        end_effector: Whose place and tilt are scored; None where the joints alone are.
     """
 
     name: str
@@ -86,6 +92,7 @@ class JointPlant:
     rest_angle: Callable[[Array], Array]
     home: Array
     imu_arm_m: float | None = None
+    end_effector: EndEffector | None = None
 
     @property
     def joint_names(self) -> list[str]:
@@ -232,7 +239,10 @@ class JointTask(Stateful):
                 "choose link_encoder to observe the links of several"
             )
         self._plant, self._joints, self._observes_imu = plant, joints, observe_imu
-        self.metrics: Sequence[Metric] = METRICS_OF_ONE if n == 1 else METRICS_OF_SEVERAL
+        self.metrics: Sequence[Metric] = (
+            *(METRICS_OF_ONE if n == 1 else METRICS_OF_SEVERAL),
+            *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
+        )
         others = [sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR]
         self._sensors = FurtherSensors(
             others, dict.fromkeys(joints), config.scenario, plant.true.encoder_counts_per_turn, num_worlds
@@ -359,6 +369,9 @@ class JointTask(Stateful):
             shown = {name: values[:, 0].copy() for name, values in of_joints.items()}
         else:
             shown = self._of_several(of_joints)
+        if self._plant.end_effector is not None:
+            distance, tilt = self._plant.end_effector.errors(sample.q_ref, state.q)
+            shown |= {"end_effector_error": distance, "end_effector_tilt": tilt}
         return {"time_s": sample.step * self.config.control_period_s, **shown, "rest": sample.rest.copy()}
 
     def _of_several(self, of_joints: dict[str, Array]) -> Signals:

@@ -190,7 +190,7 @@ def _of_ones_own(name: str) -> Environment:
     if not isinstance(robot, JointRobot):
         raise ConfigurationError(f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}")
     robot.register()
-    return replace(_JOINTS, id=robot.id)
+    return replace(_JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR, id=robot.id)
 
 
 def _kind(reference: Reference) -> str:
@@ -276,6 +276,24 @@ _JOINTS = replace(
     on_hardware="",
 )
 """Several joints on a fixed base: the figures are those of all joints together."""
+
+_TOOL = Column("end effector error rms", "end_effector_error_rms_m")
+_WITH_END_EFFECTOR = replace(
+    _JOINTS,
+    columns=(
+        Column("end effector", "end_effector_error_rms_m", note="rms distance from where the reference has it"),
+        Column("tilt", "end_effector_tilt_rms_rad", note="rms angle of the end effector from the reference"),
+        *_JOINTS.columns,
+    ),
+    traced=("time_s", "end_effector_error", "end_effector_tilt", *_JOINTS.traced[1:]),
+    subject="end effector and link error",
+    overview=_TOOL,
+    swept=(_TOOL, *_JOINTS.swept),
+    judged=(_TOOL,),
+    also=_JOINTS.judged,
+    curves=(TracedSignal("end effector error", "end_effector_error", "mm", 1e3), *_JOINTS.curves),
+)
+"""The same robots where what counts is the place of an end effector."""
 
 _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
 

@@ -1,0 +1,137 @@
+"""Where the end effector of a tree of hinges is, for a batch of poses at once."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.compiled import compile_now, compiled
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.tree import Tree
+from elastic_env.dynamics.tree_kernels import LINK
+
+
+class EndEffector:
+    """Position and orientation of a site or body, on (..., n) joint angles.
+
+    Args:
+        model: Compiled rigid model on a fixed base.
+        joints: Hinges that move, in the order of the last axis.
+        name: Site, or else body.
+        held: Position of every other joint, a hinge [rad] or a slide [m].
+
+    Raises:
+        ConfigurationError: There is no such site or body, or no joint moves it.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, joints: Sequence[str], name: str, held: Mapping[str, float] | None = None
+    ) -> None:
+        self.body, self.place, R = _found(model, name)
+        tree = Tree.of(model, joints, held or {}, gravcomp=False)
+        self._chain = _chain(tree, self.body)
+        if len(self._chain) < 2:
+            raise ConfigurationError(
+                f"end_effector {name!r} is on {model.body(self.body).name!r}, which no joint moves"
+            )
+        self._chain[-1]["R"] = tree.R[self.body] @ R
+        self._chain[-1]["anchor"] = tree.place[self.body] + tree.R[self.body] @ self.place
+        self._n = len(joints)
+        compile_now(self.pose, np.zeros((1, self._n)))
+
+    def pose(self, q: Array) -> tuple[Array, Array]:
+        """Position (..., 3) [m] and orientation (..., 3, 3) in the world, from (..., n) [rad]."""
+        position, R, *_ = self._walked(q)
+        return position.reshape(*q.shape[:-1], 3), R.reshape(*q.shape[:-1], 3, 3)
+
+    def jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Derivative of the position and of the turn, (..., 3, n) each [m/rad], [1], in the world's axes."""
+        position, _, axes, anchors = self._walked(q)
+        moved, turned = np.zeros((2, len(position), 3, self._n))
+        columns = self._chain["column"][:-1]
+        moved[:, :, columns] = np.cross(axes, position[:, None] - anchors).swapaxes(1, 2)
+        turned[:, :, columns] = axes.swapaxes(1, 2)
+        shape = (*q.shape[:-1], 3, self._n)
+        return moved.reshape(shape), turned.reshape(shape)
+
+    def errors(self, q_ref: Array, q: Array) -> tuple[Array, Array]:
+        """Distance (...) [m] and angle (...) [rad] between what is wanted and what is."""
+        wanted, R_wanted = self.pose(q_ref)
+        found, R_found = self.pose(q)
+        # of small angles the sine of the half angle is exact, the cosine is not
+        half = np.linalg.norm(R_found - R_wanted, axis=(-2, -1)) / math.sqrt(8.0)
+        return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
+
+    def _walked(self, q: Array) -> tuple[Array, ...]:
+        """Position and orientation of the end effector; axis and anchor of each hinge before it, a row per pose."""
+        rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)
+        count, hinges = len(rows), len(self._chain) - 1
+        made = [np.empty((count, *shape)) for shape in ((3,), (3, 3), (hinges, 3), (hinges, 3))]
+        walk(self._chain, rows, *made)
+        return tuple(made)
+
+
+def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
+    """Body of a site or body, place and orientation in it."""
+    sites = {model.site(i).name: i for i in range(model.nsite)}
+    bodies = {model.body(i).name: i for i in range(1, model.nbody)}
+    if name in sites:
+        at, R = sites[name], np.zeros(9)
+        mujoco.mju_quat2Mat(R, model.site_quat[at])
+        return int(model.site_bodyid[at]), model.site_pos[at].copy(), R.reshape(3, 3)
+    if name not in bodies:
+        raise unknown_name("site or body for end_effector", name, [one for one in (*sites, *bodies) if one])
+    return bodies[name], np.zeros(3), np.eye(3)
+
+
+def _chain(tree: Tree, body: int) -> Any:
+    """Links from the base to what carries a body, and one more for what is fixed to it."""
+    path, link = [], tree.carrier[body]
+    while link > 0:
+        path.insert(0, link)
+        link = int(tree.links[link]["parent"])
+    return np.concatenate([tree.links[path], np.zeros(1, LINK)])
+
+
+@compiled
+def walk(chain: Any, q: Array, position: Array, orientation: Array, axes: Array, anchors: Array) -> None:
+    """Poses of a chain of hinges, a row after the other.
+
+    Args:
+        chain: Rows of `LINK`, each in the frame of the one before it; the last is fixed to its parent.
+        q: Joint angles, (rows, n) [rad].
+        position: Of the last row, into (rows, 3) [m].
+        orientation: Of the last row, into (rows, 3, 3).
+        axes: Of the hinges in the world, into (rows, len(chain) - 1, 3).
+        anchors: Points on these axes, into (rows, len(chain) - 1, 3) [m].
+    """
+    hinges = len(chain) - 1
+    R, moved, p = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for row in range(len(q)):
+        for i in range(3):
+            p[i] = 0.0
+            for k in range(3):
+                R[i, k] = 1.0 if i == k else 0.0
+        for at in range(hinges + 1):
+            link = chain[at]
+            frame, anchor = link["R"], link["anchor"]
+            for i in range(3):
+                p[i] += R[i, 0] * anchor[0] + R[i, 1] * anchor[1] + R[i, 2] * anchor[2]
+            for i in range(3):
+                for k in range(3):
+                    moved[i, k] = R[i, 0] * frame[0, k] + R[i, 1] * frame[1, k] + R[i, 2] * frame[2, k]
+            R[:] = moved
+            if at == hinges:
+                break
+            angle = q[row, link["column"]] - link["zero"]
+            c, s = math.cos(angle), math.sin(angle)
+            for i in range(3):
+                R[i, 0], R[i, 1] = c * moved[i, 0] + s * moved[i, 1], c * moved[i, 1] - s * moved[i, 0]
+                axes[row, at, i], anchors[row, at, i] = R[i, 2], p[i]
+        for i in range(3):
+            position[row, i] = p[i]
+            for k in range(3):
+                orientation[row, i, k] = R[i, k]
