@@ -24,13 +24,14 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import link_name, motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import give_keyframes, take_keyframes
-from elastic_env.joint.time_step import is_stable, largest_stable_timestep
+from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
 
 Form = Literal["tendon", "series", "rigid"]
 ActuatorRule = Literal["keep", "replace"]
 
 _JOINT = mujoco.mjtTrn.mjTRN_JOINT
 _ON_JOINT = (_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 _ROTOR_MASS = 1e-12  # MuJoCo wants mass on every moving body; the rotor's inertia is its joint's armature
 # MuJoCo's default friction constraint creeps: it loses nearly all of 5 N·m within 10 s at rest
 _FRICTION_SOLREF = (0.001, 1.0)
@@ -49,8 +50,14 @@ def make_elastic(
     sensors and equalities on the link angle, actuators on the rotor. Its armature, which stands for the rotor, is
     replaced by the rotor inertia. Keyframes get the rotors at their link angles, without deflection.
 
+    The elastic model follows its springs at the physics step of the model. The integrator becomes `implicitfast` where
+    the model's own does not follow them. MuJoCo's automatic reset is off, so that a divergence shows as NaN in the
+    state and as a warning in `data.warning`. A model that starts anew would look as if it were well. With dampers,
+    `implicitfast` moves a joint as if rotor and link each had the inertia D times the physics step more: choose a step
+    for which that is small.
+
     Args:
-        spec: Any specification with hinges; it is not changed.
+        spec: Any specification with hinges; it is not changed. Set its physics step before.
         joints: Parameters by hinge name.
         form: "tendon", "series" or "rigid", see the module.
         actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where there is none;
@@ -61,21 +68,25 @@ def make_elastic(
 
     Raises:
         ConfigurationError: Unknown form or hinge, a joint that is no hinge, a name that is already taken, or
-            parameters that the series form cannot represent.
+            parameters that the series form cannot represent. Or `implicitfast` does not follow the joints either at
+            the physics step of the model; the message names the largest step at which it does.
 
     Warns:
-        UserWarning: The model's integrator and physics step do not follow the elastic joints, or a servo is left out
-            because the hinge keeps its actuators.
+        UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its actuators.
     """
     elastic = transformed(spec, joints, form, actuators)
-    _warn_of_explosion(elastic)
+    elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    _choose_integrator(elastic)
     return elastic
 
 
 def transformed(
     spec: mujoco.MjSpec, joints: Mapping[str, ElasticJoint], form: Form = "tendon", actuators: ActuatorRule = "keep"
 ) -> mujoco.MjSpec:
-    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at their stability then."""
+    """`make_elastic` for a caller that chooses integrator and physics step later, and looks at their stability then.
+
+    The integrator and the automatic reset are those of the given specification.
+    """
     require_known("form", [form], get_args(Form))
     require_known("actuator rule", [actuators], get_args(ActuatorRule))
     elastic = spec.copy()
@@ -87,20 +98,24 @@ def transformed(
     return elastic
 
 
-def _warn_of_explosion(spec: mujoco.MjSpec) -> None:
-    """Say so where the model's integrator does not follow its elastic joints: MuJoCo would start it anew silently."""
+def _choose_integrator(spec: mujoco.MjSpec) -> None:
+    """Let the integrator be `implicitfast` where the model's own does not follow the joints; refuse if neither does."""
     model = spec.compile()
     if is_stable(model):
         return
-    own = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    cure = f"take a physics step of at most {largest_stable_timestep(model) / 1.1:.2g} s with it"
-    if is_stable(model):
-        cure = "that follows them"
+    tried = [mujoco.mjtIntegrator(model.opt.integrator), _IMPLICITFAST]
+    names = " and ".join(dict.fromkeys(integrator.name.removeprefix("mjINT_") for integrator in tried))
+    step = f"at a physics step of {model.opt.timestep:g} s"
+    model.opt.integrator = _IMPLICITFAST
+    if not is_stable(model):
+        raise ConfigurationError(
+            f"the elastic joints explode {step} with {names}; set spec.option.timestep to at most "
+            f"{with_room(largest_stable_timestep(model)):g} s before they are made elastic, or give them more damping"
+        )
+    spec.option.integrator = _IMPLICITFAST
     warnings.warn(
-        f"the elastic joints explode with the integrator {own} at a physics step of {model.opt.timestep:g} s, after "
-        "which MuJoCo starts a model anew without a word; set spec.option.integrator to "
-        f"mujoco.mjtIntegrator.mjINT_IMPLICITFAST, {cure}",
+        f"the elastic joints explode with {tried[0].name.removeprefix('mjINT_')} {step}; the elastic model has the "
+        "integrator IMPLICITFAST, which follows them",
         stacklevel=3,
     )
 

@@ -21,7 +21,10 @@ _LARGEST_RADIUS = 1.0 + 1e-3
 """Largest eigenvalue that counts as stable; those of a free body are 1, up to the error of the differences."""
 _DIFFERENCE = 1e-6
 _HALVINGS = 24
-_LEFT_OUT = [int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}")) for what in ("CONTACT", "LIMIT", "GRAVITY")]
+_LEFT_OUT = [
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{what}")) for what in ("CONTACT", "LIMIT", "GRAVITY", "AUTORESET")
+]
+"""What holds a joint back, and the reset that would put numbers in the place of a step that gives none."""
 
 
 def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> float:
@@ -69,6 +72,12 @@ def is_stable(model: mujoco.MjModel) -> bool:
     return spectral_radius(model, _ROOM * model.opt.timestep) <= _LARGEST_RADIUS
 
 
+def with_room(timestep_s: float) -> float:
+    """The largest physics step of two digits that is a tenth below a limit of stability [s]."""
+    digit = 10.0 ** (np.floor(np.log10(timestep_s / _ROOM)) - 1.0)
+    return float(np.floor(timestep_s / _ROOM / digit) * digit)
+
+
 def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
     """Refuse a model whose joints explode with its physics step.
 
@@ -91,7 +100,7 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
 def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
     """The model with nothing that holds a joint back."""
     linear = copy.copy(model)
-    linear.opt.disableflags |= sum(_LEFT_OUT)
+    linear.opt.disableflags |= int(np.bitwise_or.reduce(_LEFT_OUT))
     linear.dof_frictionloss[:] = 0.0
     linear.tendon_frictionloss[:] = 0.0
     linear.tendon_lengthspring[:] = linear.tendon_lengthspring.mean(axis=1, keepdims=True)
