@@ -16,11 +16,12 @@ from tests.prose import sentences, words
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PLAIN = ["README.md", *(f"docs/{name}.md" for name in (
-    "index", "concepts", "equations", "commands", "testing", "limits", "policies", "leaderboard", "trials",
-    "arms", "comparison", "iterative", "options", "testbed", "training",
-))]  # fmt: skip
-"""Pages that are held to plain English; a page joins when it has been rewritten."""
+WRITTEN_ELSEWHERE = {"cluster", "robots"}
+"""Pages that are being rewritten."""
+PLAIN = ["README.md", *sorted(
+    f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md") if page.stem not in WRITTEN_ELSEWHERE
+)]  # fmt: skip
+"""Pages that are held to plain English."""
 MOST_WORDS, LONGEST = 900, 25
 
 
@@ -51,7 +52,7 @@ def test_sentences_are_short(name: str) -> None:
     """Catches a sentence that a tired reader must read twice."""
     found = sentences((ROOT / name).read_text(encoding="utf-8"))
     assert [sentence for sentence in found if words(sentence) > LONGEST] == []
-    assert np.percentile([words(sentence) for sentence in found], 90) < LONGEST
+    assert np.percentile([0, *(words(sentence) for sentence in found)], 90) < LONGEST
 
 
 def test_sentences_are_found() -> None:
