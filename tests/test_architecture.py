@@ -70,7 +70,7 @@ def test_nobody_draws_from_global_randomness(file: Path) -> None:
 ROOMS = [
     "elastic_env.core", "elastic_env.rendering", "elastic_env.joint", "elastic_env.dynamics", "elastic_env.motion",
     "elastic_env.runtime", "elastic_env.registration", "elastic_env.robots.joint_robot", "elastic_env.robots.testbed",
-    "elastic_env.robots.thormang",
+    "elastic_env.robots.thormang", "elastic_env.robots.gallery",
     "elastic_env.hardware", "elastic_env.hardware.servo_bus", "elastic_env.hardware.safety", "elastic_env.hardware.imu",
     "elastic_env.hardware.testbed", "elastic_env.hardware.emulator", "elastic_env",
     "baselines.compensation", "baselines.walking", "baselines.estimation", "baselines.adaptation",

@@ -8,6 +8,7 @@ import mujoco
 from elastic_env.core.errors import ConfigurationError
 
 _LARGEST_BYTES = 50_000_000
+_SHAPES, _READABLE = ("visual", "collision"), (".stl", ".obj")
 
 
 def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujoco.MjModel:
@@ -36,21 +37,61 @@ def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujo
         raise ConfigurationError(f"{path} is no XML: {error}; give a file of MJCF (.xml) or URDF (.urdf)") from None
     try:
         is_urdf = root.tag == "robot"
-        spec = mujoco.MjSpec.from_string(_without_shapes(root)) if is_urdf else mujoco.MjSpec.from_file(str(path))
+        spec = urdf_spec(root) if is_urdf else mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ConfigurationError(f"MuJoCo cannot read {path}: {error}") from None
     return _compiled(spec, str(path))
 
 
-def _without_shapes(robot: ET.Element) -> str:
-    """A URDF of its inertias alone."""
+def urdf_spec(robot: ET.Element, meshes: Path | None = None) -> mujoco.MjSpec:
+    """A specification from the root of a URDF; links that are fixed to others keep their names.
+
+    Args:
+        robot: It is changed: of its shapes those are left that are drawn.
+        meshes: Folder under which meshes of the URDF are drawn, found by the end of their path; None for no shapes.
+            They have no mass and touch nothing. Of a link whose visual meshes MuJoCo cannot read its collision meshes
+            are drawn, or nothing.
+
+    Raises:
+        ValueError: MuJoCo cannot read it.
+    """
     for link in robot.iter("link"):
-        for shape in [part for part in link if part.tag in ("visual", "collision")]:
+        drawn = [] if meshes is None else _drawn(link, meshes)
+        for shape in [part for part in link if part.tag in _SHAPES]:
             link.remove(shape)
+        for shape in drawn:
+            shape.tag = "visual"
+            link.append(shape)
     for own in robot.findall("mujoco"):
         robot.remove(own)
-    ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler", fusestatic="false", strippath="true")
-    return ET.tostring(robot, encoding="unicode")
+    options = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
+    ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler", options)
+    spec = mujoco.MjSpec.from_string(ET.tostring(robot, encoding="unicode"))
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a mesh that is not closed has no volume
+    for geom in spec.geoms:
+        geom.mass = geom.contype = geom.conaffinity = 0
+    return spec
+
+
+def _drawn(link: ET.Element, meshes: Path) -> list[ET.Element]:
+    """Visual or collision shapes of a link, whichever MuJoCo reads all of, with the paths of their meshes."""
+    for tag in _SHAPES:
+        shapes = link.findall(tag)
+        found = [(mesh, _mesh_file(mesh.get("filename", ""), meshes)) for s in shapes for mesh in s.iter("mesh")]
+        if shapes and all(path is not None for _, path in found):
+            for mesh, path in found:
+                mesh.set("filename", str(path))
+            return shapes
+    return []
+
+
+def _mesh_file(name: str, meshes: Path) -> Path | None:
+    """The file of a mesh, whose name in a URDF may begin with `package://`; None if MuJoCo cannot read it."""
+    parts = Path(name.removeprefix("package://")).parts
+    candidates = [meshes.joinpath(*parts[first:]) for first in range(len(parts))]
+    path = next((path for path in candidates if path.is_file()), None)
+    return path if path is not None and path.suffix.lower() in _READABLE else None
 
 
 def _compiled(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
