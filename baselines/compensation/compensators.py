@@ -294,12 +294,9 @@ def presliding_friction(friction: Array, displacement: Array, coulomb: Array) ->
 
 def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:
     """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg where the legs do not couple, (..., n) [rad]."""
-    K = np.broadcast_to(stiffness, q.shape)
-    if not isinstance(gravity, LegTorque):
-        return solve_stiffness(K, gravity.gravity_gradient(q), torque)
-    blocks = gravity.gradient_by_leg(q)
-    by_leg = blocks.shape[:-1]
-    return solve_stiffness(K.reshape(by_leg), blocks, torque.reshape(by_leg)).reshape(q.shape)
+    if isinstance(gravity, LegTorque):
+        return gravity.solved(q, stiffness, torque)
+    return solve_stiffness(np.broadcast_to(stiffness, q.shape), gravity.gravity_gradient(q), torque)
 
 
 def _first_order(state: Array, target: Array, time_constant_s: Array, period_s: float) -> Array:

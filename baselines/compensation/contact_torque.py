@@ -12,15 +12,17 @@ contact point is, and what of the robot has mass, is chosen by name:
 In single support over its foot, `com` is the exact multibody torque.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from baselines.compensation import contact_kernels as kernels
+from baselines.compensation.observed import ObservedWalk
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.contact_force import shares
-from elastic_env.dynamics.leg_chains import LegChains, LegLoads, LegPosture
+from elastic_env.dynamics.leg_chains import LegChains
+from elastic_env.dynamics.leg_kernels import solutions
+from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.runtime.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
@@ -30,9 +32,9 @@ _LEGS, _PER_LEG = 2, 6
 
 def gravity_in_pelvis(attitude: Array, gravity: float) -> Array:
     """Acceleration of gravity in the frame of a pelvis with roll and pitch, (..., 2) [rad] to (..., 3) [m/s²]."""
-    roll, pitch = attitude[..., 0], attitude[..., 1]
-    down = [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
-    return -gravity * np.stack(down, axis=-1)
+    found = np.empty((*attitude.shape[:-1], 3))
+    kernels.gravities(np.ascontiguousarray(attitude).reshape(-1, 2), gravity, found.reshape(-1, 3))
+    return found
 
 
 class LegTorque:
@@ -40,16 +42,15 @@ class LegTorque:
 
     Args:
         chains: The legs.
-        loads: What loads them in a posture.
+        loads: What loads them, rows as of `LegChains.loads`, (num_worlds,).
     """
 
-    def __init__(self, chains: LegChains, loads: Callable[[LegPosture], LegLoads]) -> None:
+    def __init__(self, chains: LegChains, loads: Any) -> None:
         self._chains, self._loads = chains, loads
-        self._last: tuple[Array, LegLoads] | None = None
 
     def gravity_torque(self, q: Array) -> Array:
         """See `GravityModel`."""
-        return self._at(q).torque().reshape(q.shape)
+        return self._chains.torque(self._loads, _by_leg(q)).reshape(q.shape)
 
     def gravity_gradient(self, q: Array) -> Array:
         """See `GravityModel`; not symmetric under a wrench, which turns with its foot."""
@@ -57,14 +58,32 @@ class LegTorque:
 
     def gradient_by_leg(self, q: Array) -> Array:
         """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        return self._at(q).gradient()
+        return self._chains.gradient(self._loads, _by_leg(q))
 
-    def _at(self, q: Array) -> LegLoads:
-        """At joint angles; torque and gradient are asked for at the same ones."""
-        if self._last is None or not np.array_equal(self._last[0], q):
-            posture = self._chains.posture(q.reshape(*q.shape[:-1], _LEGS, _PER_LEG))
-            self._last = q.copy(), self._loads(posture)
-        return self._last[1]
+    def solved(self, q: Array, stiffness: Array, torque: Array) -> Array:
+        """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
+
+        Args:
+            q: (num_worlds, 12) [rad].
+            stiffness: K, (12,) [N·m/rad].
+            torque: τ, (num_worlds, 12) [N·m].
+
+        Returns:
+            (num_worlds, 12) [rad].
+
+        Raises:
+            ElasticError: The matrix is singular.
+        """
+        legs, K, x = _by_leg(q), stiffness.reshape(_LEGS, _PER_LEG), np.empty(q.shape)
+        if not solutions(self._chains.legs, self._loads, legs, K, _by_leg(torque), _by_leg(x)):
+            # says so if it is singular
+            solve_stiffness(np.broadcast_to(K, legs.shape), self.gradient_by_leg(q), _by_leg(torque))
+        return x
+
+
+def _by_leg(values: Array) -> Array:
+    """(num_worlds, 12) as (num_worlds, 2, 6), in the same memory where it is one piece."""
+    return np.ascontiguousarray(values).reshape(-1, _LEGS, _PER_LEG)
 
 
 class ContactGravity:
@@ -76,11 +95,12 @@ class ContactGravity:
     """
 
     def __init__(self, model: WalkerModel, method: ContactMethod = "com") -> None:
-        self._model, self._method = model, method
-        table, biped = model.observation_table, model.biped
-        self._share, self._zmp = table.group("load_share"), table.group("zmp_reference")
-        self._attitude = table.group("imu_attitude")
-        self._down = np.array([0.0, 0.0, -biped.gravity])
+        biped = model.biped
+        self._observed, self._chains = ObservedWalk(model.observation_table), biped.chains
+        contact = (
+            biped.gravity, biped.chains.mass, biped.footholds, biped.ankle_height, method == "com", method != "lumped",
+        )  # fmt: skip
+        self._contact: Any = np.array([contact], kernels.CONTACT)
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
         """The gravity torque under the load share of observations, (num_worlds, m).
@@ -89,19 +109,9 @@ class ContactGravity:
             rows: Observations.
             level: Whether the pelvis is level, as commanded, or tilted as the IMU says.
         """
-        biped = self._model.biped
-        weights = shares(rows[:, self._share][:, 0])
-        # not by @, whose last bit depends on the number of rows
-        middle = (weights[:, :, None] * biped.footholds).sum(axis=1)
-        rest = rows[:, self._zmp] - middle
-        in_sole = np.zeros((len(rows), _LEGS, 3))
-        if self._method == "com":
-            in_sole[..., :2] = rest[:, None]
-            in_sole[..., 2] = -biped.ankle_height
-        gravity = self._down if level else gravity_in_pelvis(rows[:, self._attitude], biped.gravity)
-        lifted = -biped.chains.mass * weights  # what the ground carries is a negative mass where it does
-        legs_weigh = self._method != "lumped"
-        return LegTorque(biped.chains, lambda legs: LegLoads(legs, gravity, lifted, in_sole, legs_weigh=legs_weigh))
+        loads = self._chains.loads(len(rows))
+        kernels.planned_loads(self._observed.fields(rows), self._contact, level, loads)
+        return LegTorque(self._chains, loads)
 
 
 class WrenchTorque:
@@ -112,18 +122,14 @@ class WrenchTorque:
     """
 
     def __init__(self, model: WalkerModel) -> None:
-        self._model = model
-        table = model.observation_table
-        self._wrench, self._attitude = table.group("wrench"), table.group("imu_attitude")
+        self._observed, self._chains = ObservedWalk(model.observation_table), model.biped.chains_above_feet
+        self._gravity = model.biped.gravity
 
     def at(self, rows: Array, level: bool = False) -> LegTorque:
         """The torque under the wrenches of observations, (num_worlds, m); `level` as in `ContactGravity.at`."""
-        biped = self._model.biped
-        attitude = np.zeros((len(rows), 2)) if level else rows[:, self._attitude]
-        gravity = gravity_in_pelvis(attitude, biped.gravity)
-        wrench = rows[:, self._wrench].reshape(-1, _LEGS, 2, 3)
-        force, moment = wrench[..., 0, :], wrench[..., 1, :]
-        return LegTorque(biped.chains_above_feet, lambda legs: LegLoads(legs, gravity, wrench=(force, moment)))
+        loads = self._chains.loads(len(rows))
+        kernels.measured_loads(self._observed.fields(rows), self._gravity, level, loads)
+        return LegTorque(self._chains, loads)
 
 
 class PlannedTorque:

@@ -17,7 +17,7 @@ import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
 from elastic_env.core.signals import Array, BoolArray, Signal
-from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
+from elastic_env.dynamics.leg_kernels import sole_tilts
 from elastic_env.runtime.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
@@ -105,19 +105,11 @@ class BendingObserver:
         Returns:
             (num_worlds, 2 legs, 2) each, roll and pitch [rad].
         """
-        theta, attitude = rows[:, self._theta], rows[:, self._attitude]
-        bent = bending.reshape(len(rows), 2, -1).transpose(2, 0, 1)
-        chains = self._model.biped.chains
-        posture = chains.posture(theta.reshape(len(rows), 2, -1))
-        normal, turn = pair = np.zeros((2, 3, *bent.shape[1:]))
-        normal[2] = 1.0
-        vectors = pair.swapaxes(0, 1)
-        for j in range(len(chains.axis) - 1, -1, -1):
-            posture.into_parent(j, vectors, out=vectors)
-            turn[chains.axis[j]] += bent[j]
-        R = rotation_of_tilt(attitude).swapaxes(-1, -2)
-        up, expected = (np.moveaxis(vector, 0, -1) @ R for vector in pair)
-        return np.stack([-up[..., 1], up[..., 0]], axis=-1), expected[..., :2]
+        q, bent = (values.reshape(len(rows), 2, -1) for values in (rows[:, self._theta], bending))
+        attitude = np.ascontiguousarray(rows[:, self._attitude])
+        seen, expected = np.empty((2, len(rows), *_SHAPE))
+        sole_tilts(self._model.biped.chains.axis, q, attitude, bent, seen, expected)
+        return seen, expected
 
 
 def _symmetric(upper: Array) -> Array:

@@ -25,15 +25,14 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.inputs import PolicyInputs, shifted_share
+from baselines.compensation.observed import ObservedWalk, Records
 from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
+from baselines.walking import walking_kernels as kernels
 from baselines.walking.posture import hip_offsets
 from baselines.walking.zmp_shift import center_of_mass_following, center_of_mass_per_pelvis, pelvis_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.contact_force import shares
-from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
-from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -74,9 +73,8 @@ class LocalFrame:
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
     """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2) [rad]."""
-    com, soles = biped.chains.com_and_feet(q.reshape(len(q), 2, -1), (0.0, 0.0, -biped.ankle_height))
-    R = rotation_of_tilt(attitude)
-    return LocalFrame((R @ com[..., None])[..., 0], soles @ R.swapaxes(-1, -2))
+    point = (0.0, 0.0, -biped.ankle_height)
+    return LocalFrame(*biped.chains.com_and_feet(q.reshape(len(q), 2, -1), point, attitude))
 
 
 class WalkingController(PolicyWithInputs):
@@ -103,18 +101,16 @@ class WalkingController(PolicyWithInputs):
         ramp_s: float = STAND_S,
     ) -> None:
         self._model, self._biped, self._plan = model, model.biped, model.plan
-        self._com_feedback, self._gains = com_feedback, gains or WalkingGains()
         table = model.observation_table
-        self._view = ObservationView(table, model.control_period_s)
-        self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
-        self._clock, self._share = table.group("clock"), table.group("load_share")
-        self._dt = model.control_period_s
-        self._ramp_steps = max(round(ramp_s / self._dt), 1)
-        stiffness = model.stiffness.reshape(2, 6)
-        self._ankle_stiffness = stiffness[:, 4:]
-        self._weight_of_feet = self._biped.weight - self._biped.chains_above_feet.mass * self._biped.gravity
+        self._view, self._observed = ObservationView(table, model.control_period_s), ObservedWalk(table)
+        self._attitude, self._clock = table.group("imu_attitude"), table.group("clock")
+        self._dt, steps = model.control_period_s, max(round(ramp_s / model.control_period_s), 1)
+        self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
+        self._constants: Any = np.array([_constants(model, com_feedback, gains or WalkingGains())], kernels.CONTROLLER)
+        self._plan_rows: Any = np.zeros(self._plan.num_steps + 1, kernels.PLAN)
+        for name in kernels.PLAN.names or ():
+            self._plan_rows[name] = getattr(self._plan, name)
         self._per_pelvis = center_of_mass_per_pelvis(model)
-        self._friction_deflection = model.coulomb_friction / model.stiffness
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -136,34 +132,18 @@ class WalkingController(PolicyWithInputs):
         rows = self._view.rows(observation)
         frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
         memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        steps, z, last, velocity, shift, planned, weight = np.split(memory, [1, 2, 6, 8, 10, 14], axis=1)
-        steps = steps + 1.0
-        share = np.ones_like(steps) if (steps >= self._ramp_steps).all() else minimum_jerk(steps / self._ramp_steps)
-        row = np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
-        if self._gains.weight_filter_s is not None:
-            load = self._vertical_forces(rows).sum(axis=1, keepdims=True) + self._weight_of_feet
-            weight = weight + _share(self._dt, self._gains.weight_filter_s) * (load - weight)
-        z = self._leg_difference(rows, row, z, weight, inputs)
-        coms, before = frame.com_from_soles[..., :2], planned[:, 2:]
-        planned = self._planned_shift(inputs, planned, share)
-        if self._com_feedback:
-            seen = coms - planned[:, None, 2:], last.reshape(coms.shape) - before[:, None]
-            velocity, shift = self._zmp_shift(rows, row, seen, (velocity, shift), inputs.balance_gain)
-        at_ankles, against_friction = self._ankle_offsets(rows, shift), self._friction_offsets(rows)
-        if inputs.deflection is not None:
-            wound = 1.0 + inputs.deflection
-            at_ankles, against_friction = wound * at_ankles, wound * against_friction
-        lengthened = z if inputs.leg_length is None else z + inputs.leg_length
-        moved = self._leg_offsets(rows, lengthened) + at_ankles
-        if inputs.hip is not None:
-            moved = moved + hip_offsets(inputs.hip)
-        action = share * moved + against_friction
-        if planned.any():
-            coming = np.minimum(row + 1, self._plan.num_steps)
-            action = action + pelvis_shift_offsets(self._model, coming, planned[:, 2:] / self._per_pelvis)
-        kept = np.hstack([steps, z, coms.reshape(len(rows), 4), velocity, shift, planned, weight])
-        action = action.astype(np.float32)
-        return action.reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
+        n, kept, action = len(rows), np.empty(memory.shape), np.empty((len(rows), len(self._model.joints)))
+        before, now = self._fields(memory), self._fields(kept)
+        is_shifted = inputs.zmp is not None or inputs.com is not None or np.count_nonzero(memory[:, _PLANNED]) > 0
+        kept[:, _PLANNED] = self._planned_shift(inputs, memory) if is_shifted else 0.0
+        shares = _NO_SHARES if inputs.zmp_shift is None else self._shifted_shares(rows, inputs.zmp_shift)
+        seen = self._observed.fields(rows), frame.com, frame.soles, shares
+        walk = self._constants, self._plan_rows, self._ramp
+        kernels.control(walk, seen, _dense(inputs, n), before, now, action)
+        if is_shifted:
+            coming = np.minimum(self._row(rows) + 1, self._plan.num_steps)
+            action += pelvis_shift_offsets(self._model, coming, now["planned"] / self._per_pelvis)
+        return action.astype(np.float32).reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
         """The encoder angles, (..., 12) [rad]: without an output compensator it takes motors for links."""
@@ -171,82 +151,69 @@ class WalkingController(PolicyWithInputs):
         return self._view.theta(rows).reshape((*observation.shape[:-1], -1))
 
     def _begin(self, frame: LocalFrame) -> Array:
-        coms = frame.com_from_soles[..., :2].reshape(len(frame.com), 4)
-        weight = np.full((len(coms), 1), self._biped.weight)
-        return np.hstack([np.zeros((len(coms), 2)), coms, np.zeros((len(coms), 8)), weight])
+        memory = np.zeros((len(frame.com), kernels.MEMORY.itemsize // 8))
+        fields = self._fields(memory)
+        fields["com"], fields["weight"] = frame.com_from_soles[..., :2], self._biped.weight
+        return memory
 
-    def _planned_shift(self, inputs: PolicyInputs, planned: Array, share: Array) -> Array:
+    def _fields(self, memory: Array) -> Records:
+        """Memory, (num_worlds, 15), as rows with fields."""
+        return np.ndarray(len(memory), kernels.MEMORY, np.ascontiguousarray(memory))
+
+    def _row(self, rows: Array) -> IntArray:
+        """Rows of the plan at the ends of the last control periods, (num_worlds,)."""
+        return np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
+
+    def _planned_shift(self, inputs: PolicyInputs, memory: Array) -> Array:
         """Shift of the planned center of mass for the input `zmp`, and in all on the ramp, (num_worlds, 4) [m]."""
-        following = planned[:, :2]
+        before = self._fields(memory)
+        following, steps = before["following"], before["steps"].astype(np.int64) + 1
         if inputs.zmp is not None:
             following = center_of_mass_following(following, inputs.zmp, self._plan.omega, self._dt)
+        share = self._ramp[np.minimum(steps, len(self._ramp) - 1)][:, None]
         return np.hstack([following, share * (following if inputs.com is None else following + inputs.com)])
 
-    def _leg_difference(self, rows: Array, row: IntArray, z: Array, weight: Array, inputs: PolicyInputs) -> Array:
-        """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
-        gains, share, gain = self._gains, self._plan.share[row, None], self._gains.force_difference
-        if inputs.zmp_shift is not None:
-            share = shifted_share(share, inputs.zmp_shift[:, 1:], self._biped.foot_spacing)
-        if inputs.balance_gain is not None:
-            gain = (1.0 + inputs.balance_gain) * gain
-        vertical = self._vertical_forces(rows)
-        desired = (1.0 - 2.0 * share) * weight
-        missing = desired - (vertical[:, [LEFT]] - vertical[:, [RIGHT]])
-        z = z + self._dt * (gain * missing - z / gains.force_difference_decay_s)
-        return np.clip(z, -gains.force_difference_limit_m, gains.force_difference_limit_m)
+    def _shifted_shares(self, rows: Array, shift: Array) -> Array:
+        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]."""
+        return shifted_share(self._plan.share[self._row(rows)], shift[:, 1], self._biped.foot_spacing)
 
-    def _vertical_forces(self, rows: Array) -> Array:
-        """Along the normals of the soles, which are nearly vertical, (num_worlds, 2) [N]."""
-        return rows[:, self._wrench].reshape(-1, 2, 2, 3)[:, :, 0, 2]
 
-    def _zmp_shift(
-        self, rows: Array, row: IntArray, coms: tuple[Array, Array], kept: tuple[Array, Array], change: Array | None
-    ) -> tuple[Array, Array]:
-        """Filtered deviation of the COM velocity from the plan, and ZMP shift, (num_worlds, 2) each [m/s], [m].
+_NO_SHARES: Array = np.empty(0)
+_PLANNED = slice(10, 14)
+"""Columns of the memory that hold the shift of the planned center of mass."""
 
-        Args:
-            rows: Observations.
-            row: Row of the plan.
-            coms: COM from both soles less the shift of the plan, now and a period ago, (num_worlds, 2, 2) each [m].
-            kept: What this returned a period ago.
-            change: Relative change of the gain, (num_worlds, 1) [1].
-        """
-        gains, plan, (now, last), (velocity, shift) = self._gains, self._plan, coms, kept
-        worlds, support = np.arange(len(rows)), rows[:, self._clock][:, 2].astype(np.int64)
-        deviation = now[worlds, support] + self._biped.footholds[support] - plan.com[row]
-        deviating = (now - last)[worlds, support] / self._dt - plan.com_dot[row]
-        velocity = velocity + _share(self._dt, gains.velocity_filter_s) * (deviating - velocity)
-        error, dcm = deviation + velocity / plan.omega, gains.dcm
-        if change is not None:
-            dcm = (1.0 + change) * dcm
-        wanted = np.clip(dcm * error, -gains.zmp_limit_m, gains.zmp_limit_m)
-        return velocity, shift + _share(self._dt, gains.zmp_filter_s) * (wanted - shift)
 
-    def _leg_offsets(self, rows: Array, z: Array) -> Array:
-        """Offsets that lengthen the left leg by z/2 and shorten the right one, (num_worlds, 12) [rad]."""
-        leg = self._biped.leg
-        knee = self._view.motion(rows).q.reshape(-1, 2, 6)[..., 3]
-        distance = np.sqrt(leg.thigh**2 + leg.shank**2 + 2.0 * leg.thigh * leg.shank * np.cos(knee))
-        bend = -distance / (leg.thigh * leg.shank * np.sin(knee)) * (0.5 * np.array([1.0, -1.0]) * z)
-        # the ankle stays on the line from the hip, and the sole keeps its attitude
-        at_hip = -bend * leg.shank * (leg.shank + leg.thigh * np.cos(knee)) / distance**2
-        offsets = np.zeros((len(rows), 2, 6))
-        offsets[..., 3] = bend
-        offsets[..., 2] = at_hip
-        offsets[..., 4] = -bend - at_hip
-        return offsets.reshape(len(rows), 12)
+def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> tuple[Any, ...]:
+    """What the kernel needs to know, a row of `CONTROLLER`."""
+    biped, stiffness, period_s = model.biped, model.stiffness.reshape(2, 6), model.control_period_s
+    values = {
+        **gains.model_dump(),
+        "period_s": period_s, "is_com_fed_back": com_feedback,
+        "thigh": biped.leg.thigh, "shank": biped.leg.shank, "footholds": biped.footholds, "omega": model.plan.omega,
+        "weight": biped.weight, "weight_of_feet": biped.weight - biped.chains_above_feet.mass * biped.gravity,
+        "ankle_stiffness": stiffness[:, 4:],
+        "friction_deflection": model.coulomb_friction.reshape(2, 6) / stiffness,
+        "velocity_share": _share(period_s, gains.velocity_filter_s),
+        "zmp_share": _share(period_s, gains.zmp_filter_s),
+        "weight_share": 0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s),
+    }  # fmt: skip
+    return tuple(values[name] for name in kernels.CONTROLLER.names or ())
 
-    def _friction_offsets(self, rows: Array) -> Array:
-        """Offsets that wind the springs against the friction of joints that the plan moves, (num_worlds, 12) [rad]."""
-        return self._friction_deflection * np.tanh(self._view.motion(rows).q_dot / self._gains.friction_rate_rad_s)
 
-    def _ankle_offsets(self, rows: Array, shift: Array) -> Array:
-        """Offsets that wind the ankle springs by the torque of a ZMP shift, (num_worlds, 12) [rad]."""
-        carried = shares(rows[:, self._share][:, 0]) * self._biped.weight
-        offsets = np.zeros((len(rows), 2, 6))
-        offsets[..., 4] = carried * shift[:, [0]] / self._ankle_stiffness[:, 0]
-        offsets[..., 5] = -carried * shift[:, [1]] / self._ankle_stiffness[:, 1]
-        return offsets.reshape(len(rows), 12)
+def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
+    """Inputs as rows of `INPUTS`, (num_worlds,)."""
+    dense = np.zeros(num_worlds, kernels.INPUTS)
+    if inputs.is_empty:
+        return dense
+    if inputs.leg_length is not None:
+        dense["leg_length"] = inputs.leg_length[:, 0]
+    if inputs.balance_gain is not None:
+        dense["balance_gain"] = inputs.balance_gain[:, 0]
+    if inputs.hip is not None:
+        dense["offset"] = hip_offsets(inputs.hip).reshape(-1, 2, 6)
+    if inputs.deflection is not None:
+        dense["deflection"] = inputs.deflection.reshape(-1, 2, 6)
+    return dense
 
 
 def _share(period_s: float, time_constant_s: float) -> float:

@@ -1,4 +1,4 @@
-r"""Statics of legs hanging from one pelvis, in NumPy for a whole batch: center of mass, feet, joint torques, gradients.
+r"""Statics of legs hanging from one pelvis, for a whole batch: center of mass, feet, joint torques, gradients.
 
 Every leg is a chain of hinges about coordinate axes, so that taking a vector from link to link mixes two of its
 components. All is computed in the frames of the links.
@@ -21,26 +21,19 @@ If joint j turns, all that it carries turns about its anchor. For a joint i befo
 * a wrench (f, n) that is fixed in the foot, as a sensor in the foot measures it, changes by z_j × f and z_j × n_j. For
   i = j and i after j nothing changes.
 
-Legs do not couple: the pelvis' orientation is given by g. Vectors have their three components first and the batch last,
-(3, ..., L), joints before both, so that every operation runs over whole batches.
+Legs do not couple: the pelvis' orientation is given by g. `elastic_env.dynamics.leg_kernels` computes all this, row by
+row.
 """
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
-
-Part: TypeAlias = list[tuple[int, Array]]
-"""The components of a constant vector that are not zero, with their values on all legs."""
-
-_OTHERS = {0: (1, 2), 1: (2, 0), 2: (0, 1)}
-"""The axes into which the others turn: a rotation about the key turns the first towards the second."""
-_LEVER, _FORCE, _MOMENT = range(3)
-"""What a joint carries: first moment of the masses, and a wrench."""
+from elastic_env.dynamics import leg_kernels as kernels
 
 
 class LegChains:
@@ -55,10 +48,9 @@ class LegChains:
         ConfigurationError: A leg is no chain of single hinges about a coordinate axis, or its links are turned.
 
     Attributes:
-        axis: Coordinate axis that each joint turns about, J.
-        offset: Origin of each link in the frame of the link before it, J parts [m].
-        moment: First moment of each link from its anchor, with what is beyond it hung into the next anchor, J parts
-            [kg·m].
+        axis: Coordinate axis that each joint turns about, (J,).
+        legs: Row for the kernels, (1,): origins of the links in the frames of the links before them [m], first moments
+            of the links from their anchors, with what is beyond hung into the next anchor [kg·m].
         mass: Mass of the whole robot [kg].
     """
 
@@ -75,16 +67,15 @@ class LegChains:
         carried = np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
         offset = model.body_pos[bodies]  # (L, J, 3)
         moment = mass[..., None] * model.body_ipos[bodies]
+        last_moment = moment[:, -1].copy()
         moment[:, :-1] += carried[:, 1:, None] * offset[:, 1:]
-        self.axis: list[int] = axis.tolist()
-        self.offset, self.moment = _parts(offset), _parts(moment)
-        before = np.concatenate([np.zeros_like(moment[:, :1]), moment[:, :-1]], axis=1)
-        self._hung = _parts(np.stack([before, offset]))
-        """What taking moment and foot across a joint adds to them, (2, L) per component."""
-        self._last_moment = moment[:, -1]
+        self.axis: IntArray = axis.astype(np.int64)
         self.mass = float(model.body_mass.sum() - (0.0 if feet_weigh else model.body_mass[bodies[:, -1]].sum()))
-        self._fixed_moment = self._moment_of_the_rest(model, bodies) + carried[:, 0] @ offset[:, 0]
-        """First moment of the trunk, and of the legs as if they were in their hips [kg·m]."""
+        # of the trunk, and of the legs as if they were in their hips
+        fixed_moment = self._moment_of_the_rest(model, bodies) + carried[:, 0] @ offset[:, 0]
+        row = (self.axis, offset, moment, last_moment, fixed_moment, self.mass)
+        self.legs: Any = np.array([row], kernels.legs_type(*joints.shape))
+        self._loads = kernels.loads_type(len(joints))
 
     def posture(self, q: Array) -> "LegPosture":
         """The legs at joint angles, (..., L, J) [rad]."""
@@ -94,27 +85,41 @@ class LegChains:
         """Center of mass of the whole robot in the pelvis frame, (..., L, J) [rad] to (..., 3) [m]."""
         return self.com_and_feet(q)[0]
 
-    def com_and_feet(self, q: Array, point: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
-        """Center of mass of the whole robot, and a point that is fixed in each foot, in the pelvis frame.
+    def com_and_feet(
+        self, q: Array, point: Sequence[float] = (0.0, 0.0, 0.0), attitude: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Center of mass of the whole robot, and a point that is fixed in each foot, from the pelvis.
 
         Args:
             q: (..., L, J) [rad].
             point: From the ankle, in the frame of the foot [m].
+            attitude: Roll and pitch of the pelvis, for a level frame, (..., 2) [rad]; None for the pelvis frame.
 
         Returns:
             (..., 3) and (..., L, 3) [m].
         """
-        posture = self.posture(q)
-        shape = [2, *[1] * (q.ndim - 2), -1]
-        foot = np.broadcast_to(np.asarray(point), self._last_moment.shape)
-        pair = np.empty((3, 2, *posture.sine.shape[1:]))
-        pair[:] = np.stack([self._last_moment, foot]).transpose(2, 0, 1).reshape(3, *shape)
-        for j in range(len(self.axis) - 1, -1, -1):
-            posture.into_parent(j, pair, out=pair)
-            for component, added in self._hung[j]:
-                pair[component] += added.reshape(shape)
-        legs, feet = np.moveaxis(pair, 0, -1)
-        return (self._fixed_moment + legs.sum(axis=-2)) / self.mass, feet
+        batch, legs = q.shape[:-2], q.shape[-2]
+        com, feet = np.empty((*batch, 3)), np.empty((*batch, legs, 3))
+        tilts = _IS_PELVIS if attitude is None else as_rows(attitude, 1)
+        place = np.asarray(point, dtype=np.float64)
+        kernels.local_frames(self.legs, as_rows(q, 2), tilts, place, as_rows(com, 1), as_rows(feet, 2))
+        return com, feet
+
+    def loads(self, rows: int) -> Any:
+        """Rows for what loads the legs, (rows,), to be filled."""
+        return np.empty(rows, self._loads)
+
+    def torque(self, loads: Any, q: Array) -> Array:
+        """Joint torques that hold the legs, (rows, L, J) [rad] to [N·m]; `loads` as of `loads`, (rows,)."""
+        torque = np.empty(q.shape)
+        kernels.torques(self.legs, loads, q, torque)
+        return torque
+
+    def gradient(self, loads: Any, q: Array) -> Array:
+        """∂τ/∂q of `torque`, (rows, L, J, J) [N·m/rad]."""
+        gradient = np.empty((*q.shape, q.shape[-1]))
+        kernels.gradients(self.legs, loads, q, gradient)
+        return gradient
 
     def _moment_of_the_rest(self, model: mujoco.MjModel, bodies: IntArray) -> Array:
         """First moment of all bodies that are no leg, in the pelvis frame [kg·m]."""
@@ -126,6 +131,10 @@ class LegChains:
         return model.body_mass[others] @ relative
 
 
+_IS_PELVIS: Array = np.empty((0, 2))
+"""No attitudes: the level frame is that of the pelvis."""
+
+
 class LegPosture:
     """Legs at some joint angles.
 
@@ -135,30 +144,7 @@ class LegPosture:
     """
 
     def __init__(self, chains: LegChains, q: Array) -> None:
-        self.chains = chains
-        angles = q.transpose(-1, *range(q.ndim - 1)).copy()
-        self.sine, self.cosine = np.sin(angles), np.cos(angles)
-
-    def into_link(self, j: int, vectors: Array, out: Array) -> Array:
-        """Vectors of the link before joint j in the frame of the link behind it, (3, ...) to `out`."""
-        first, second = _OTHERS[self.chains.axis[j]]
-        return self._turned(j, vectors, out, first, second)
-
-    def into_parent(self, j: int, vectors: Array, out: Array) -> Array:
-        """Vectors of the link behind joint j in the frame of the link before it, (3, ...) to `out`, or in place."""
-        first, second = _OTHERS[self.chains.axis[j]]
-        return self._turned(j, vectors, out, second, first)
-
-    def _turned(self, j: int, vectors: Array, out: Array, first: int, second: int) -> Array:
-        """Seen from a frame that is turned from the first axis to the second."""
-        s, c, x, y = self.sine[j], self.cosine[j], vectors[first], vectors[second]
-        across_x, across_y = s * y, s * x  # before either is written over
-        turned_x, turned_y = out[first], out[second]
-        np.add(np.multiply(c, x, out=turned_x), across_x, out=turned_x)
-        np.subtract(np.multiply(c, y, out=turned_y), across_y, out=turned_y)
-        if out is not vectors:
-            out[self.chains.axis[j]] = vectors[self.chains.axis[j]]
-        return out
+        self.chains, self.q = chains, np.array(q, dtype=np.float64, order="C")
 
 
 class LegLoads:
@@ -184,95 +170,35 @@ class LegLoads:
         wrench: tuple[Array, Array] | None = None,
         legs_weigh: bool = True,
     ) -> None:
-        self._posture = posture
-        self._gravity = None if gravity is None else self._in_links(gravity)
-        self._has_wrench = wrench is not None
-        self._carried = self._carried_by_joints(mass, point, wrench, legs_weigh)
-        """What each joint carries, in the frame of its link, (J, 3, V, ...): first moment, force, moment."""
+        self._chains, self._q = posture.chains, posture.q
+        rows = as_rows(self._q, 2)
+        loads = self._chains.loads(len(rows)).reshape(self._q.shape[:-2])
+        loads[...] = 0
+        if gravity is not None:
+            loads["gravity"] = gravity
+        if mass is not None and point is not None:
+            loads["mass"], loads["point"] = mass, point
+        if wrench is not None:
+            loads["wrench"][..., 0, :], loads["wrench"][..., 1, :] = wrench
+        loads["legs_weigh"] = legs_weigh
+        self._loads, self._rows = loads.reshape(-1), rows
 
     def torque(self) -> Array:
         """Joint torques that hold the legs, (..., L, J) [N·m]."""
-        torque = np.zeros_like(self._posture.sine)
-        for j, axis in enumerate(self._posture.chains.axis):
-            carried, own = self._carried[j], torque[j]
-            if self._gravity is not None:
-                first, second = _OTHERS[axis]
-                lever, g = carried[:, _LEVER], self._gravity[j]
-                np.subtract(lever[second] * g[first], lever[first] * g[second], out=own)
-            if self._has_wrench:
-                np.subtract(own, carried[axis, _MOMENT], out=own)
-        return torque.transpose(*range(1, torque.ndim), 0)
+        return self._chains.torque(self._loads, self._rows).reshape(self._q.shape)
 
     def gradient(self) -> Array:
         """∂τ/∂q, (..., L, J, J) [N·m/rad]; symmetric without a wrench."""
-        posture, axes = self._posture, self._posture.chains.axis
-        J, V, batch = len(axes), self._carried.shape[2], posture.sine.shape[1:]
-        gradient = np.zeros((J, J, *batch))
-        changes = np.zeros((3, V, J, *batch))  # of what is carried, by the joints from j on
-        for j in range(J - 1, -1, -1):
-            axis, (first, second) = axes[j], _OTHERS[axes[j]]
-            carried, change = self._carried[j], changes[:, :, j]
-            if self._gravity is not None:  # of the moment of the weights
-                lever, g, by_weight = carried[:, _LEVER], self._gravity[j], change[:, _LEVER]
-                np.multiply(lever[first], g[axis], out=by_weight[first])
-                np.multiply(lever[second], g[axis], out=by_weight[second])
-                np.negative(lever[first] * g[first] + lever[second] * g[second], out=by_weight[axis])
-                np.negative(changes[axis, _LEVER, j:], out=gradient[j, j:])
-                gradient[j + 1 :, j] = gradient[j, j + 1 :]
-            if self._has_wrench:
-                np.subtract(gradient[j, j + 1 :], changes[axis, _MOMENT, j + 1 :], out=gradient[j, j + 1 :])
-                np.negative(carried[second, _FORCE:], out=change[first, _FORCE:])
-                change[second, _FORCE:] = carried[first, _FORCE:]
-            if j > 0:
-                moved = changes[:, :, j:]
-                self._take_across(j, posture.into_parent(j, moved, out=moved))
-        return gradient.transpose(*range(2, gradient.ndim), 0, 1)
-
-    def _in_links(self, gravity: Array) -> Array:
-        """Gravity in the frames of all links, (J, 3, ...)."""
-        posture = self._posture
-        links = np.empty((len(posture.chains.axis), 3, *posture.sine.shape[1:]))
-        vector = np.moveaxis(gravity, -1, 0)[..., None]
-        for j, link in enumerate(links):
-            vector = posture.into_link(j, vector, out=link)
-        return links
-
-    def _carried_by_joints(
-        self, mass: Array | None, point: Array | None, wrench: tuple[Array, Array] | None, legs_weigh: bool
-    ) -> Array:
-        chains, posture = self._posture.chains, self._posture
-        carried = np.zeros((len(chains.axis), 3, 1 if wrench is None else 3, *posture.sine.shape[1:]))
-        foot = carried[-1]
-        if mass is not None and point is not None:
-            foot[:, _LEVER] = mass * np.moveaxis(point, -1, 0)
-        if wrench is not None:
-            foot[:, _FORCE], foot[:, _MOMENT] = (np.moveaxis(vector, -1, 0) for vector in wrench)
-        for j in range(len(chains.axis) - 1, -1, -1):
-            if self._gravity is not None and legs_weigh:
-                for k, own in chains.moment[j]:
-                    carried[j, k, _LEVER] += own
-            if j > 0:
-                before = self._take_across(j, posture.into_parent(j, carried[j], out=carried[j - 1]))
-                if mass is not None:
-                    for k, own in chains.offset[j]:
-                        before[k, _LEVER] += mass * own
-        return carried
-
-    def _take_across(self, j: int, vectors: Array) -> Array:
-        """Moments about the anchor of joint j, now in the frame of the link before, about that link's, (3, V, ...)."""
-        if self._has_wrench:
-            force, moment = vectors[:, _FORCE], vectors[:, _MOMENT]
-            for k, own in self._posture.chains.offset[j]:  # d × f
-                first, second = _OTHERS[k]
-                moment[first] -= own * force[second]
-                moment[second] += own * force[first]
-        return vectors
+        return self._chains.gradient(self._loads, self._rows).reshape(*self._q.shape, self._q.shape[-1])
 
 
-def _parts(vectors: Array) -> list[Part]:
-    """Vectors of all joints of all legs, (..., L, J, 3), joint by joint."""
-    by_joint = vectors.transpose(-2, -1, *range(vectors.ndim - 2))
-    return [[(k, component) for k, component in enumerate(vector) if component.any()] for vector in by_joint]
+def as_rows(values: Array, own: int) -> Array:
+    """(..., a, b) with `own` axes of their own as (rows, a, b) in one piece, so that one kernel fits all."""
+    shape = values.shape
+    batch = shape[: len(shape) - own]
+    if len(batch) == 1 and values.flags.c_contiguous and values.dtype == np.float64:
+        return values
+    return np.ascontiguousarray(values, dtype=np.float64).reshape(int(np.prod(batch)), *shape[len(batch) :])
 
 
 def _require_chains(model: mujoco.MjModel, joints: IntArray, bodies: IntArray, axis: IntArray) -> None:

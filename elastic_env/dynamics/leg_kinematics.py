@@ -14,6 +14,7 @@ import numpy as np
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
+from elastic_env.dynamics import leg_kernels as kernels
 
 JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
 """Joints of a leg, from the hip to the foot."""
@@ -95,12 +96,9 @@ def rotation_z(angle: Array) -> Array:
 
 def rotation_of_tilt(attitude: Array) -> Array:
     """Rotation about x by a roll, then about y by a pitch, (..., 2) [rad] to (..., 3, 3)."""
-    sine, cosine = np.sin(attitude), np.cos(attitude)
-    R = np.zeros((*attitude.shape[:-1], 3, 3))
-    R[..., 0, 0], R[..., 2, 0] = cosine[..., 1], -sine[..., 1]
-    R[..., 1, 1], R[..., 1, 2] = cosine[..., 0], -sine[..., 0]
-    R[..., 0, 1], R[..., 0, 2] = sine[..., 1] * sine[..., 0], sine[..., 1] * cosine[..., 0]
-    R[..., 2, 1], R[..., 2, 2] = cosine[..., 1] * sine[..., 0], cosine[..., 1] * cosine[..., 0]
+    R = np.empty((*attitude.shape[:-1], 3, 3))
+    angles = np.ascontiguousarray(attitude, dtype=np.float64)
+    kernels.tilt_rotations(angles.reshape(-1, 2), R.reshape(-1, 3, 3))
     return R
 
 

@@ -1,0 +1,92 @@
+"""What loads the legs of a walker in a control step, compiled, row by row; see `baselines.compensation.contact_torque`.
+
+Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
+file, and every size comes from a type.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.compiled import compiled
+from elastic_env.core.signals import Array
+
+CONTACT = np.dtype(
+    (
+        np.record,
+        [
+            ("gravity", np.float64),  # [m/s²]
+            ("mass", np.float64),  # of the robot [kg]
+            ("footholds", np.float64, (2, 2)),  # middles of the soles [m]
+            ("ankle_height", np.float64),  # [m]
+            ("is_at_zmp", np.bool_),  # or at the ankle axes
+            ("legs_weigh", np.bool_),
+        ],
+    )
+)
+"""How the ground carries the robot."""
+
+
+@compiled
+def planned_loads(observed: Any, contact: Any, is_level: bool, loads: Any) -> None:
+    """Loads under the planned load share.
+
+    Args:
+        observed: Observations, rows with fields.
+        contact: Row of `CONTACT`, (1,).
+        is_level: Whether the pelvis is level, or tilted as the IMU says.
+        loads: To be filled, rows of `elastic_env.dynamics.leg_kernels.loads_type`.
+    """
+    ground = contact[0]
+    for world in range(len(loads)):
+        load, plan = loads[world], observed[world]
+        fill_gravity(plan, ground.gravity, is_level, load)
+        load.legs_weigh = ground.legs_weigh
+        share = plan.load_share
+        for foot in range(2):
+            weight = share if foot == 1 else 1.0 - share
+            load.mass[foot] = -ground.mass * weight  # what the ground carries is a negative mass where it does
+            for i in range(2):
+                middle = (1.0 - share) * ground.footholds[0, i] + share * ground.footholds[1, i]
+                load.point[foot, i] = plan.zmp_reference[i] - middle if ground.is_at_zmp else 0.0
+            load.point[foot, 2] = -ground.ankle_height if ground.is_at_zmp else 0.0
+            for i in range(3):
+                load.wrench[foot, 0, i] = load.wrench[foot, 1, i] = 0.0
+
+
+@compiled
+def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) -> None:
+    """Loads by the foot wrenches; `gravity` is its acceleration [m/s²], other arguments as in `planned_loads`."""
+    for world in range(len(loads)):
+        load, shown = loads[world], observed[world]
+        fill_gravity(shown, gravity, is_level, load)
+        load.legs_weigh = True
+        for foot in range(2):
+            load.mass[foot] = 0.0
+            for i in range(3):
+                load.point[foot, i] = 0.0
+                load.wrench[foot, 0, i], load.wrench[foot, 1, i] = shown.wrench[foot, 0, i], shown.wrench[foot, 1, i]
+
+
+@compiled
+def gravities(attitude: Array, gravity: float, found: Array) -> None:
+    """Gravity in the frames of pelvises with roll and pitch, (rows, 2) [rad]: into `found`, (rows, 3) [m/s²]."""
+    for row in range(len(attitude)):
+        found[row, 0], found[row, 1], found[row, 2] = gravity_of(attitude[row, 0], attitude[row, 1], gravity)
+
+
+@compiled
+def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
+    """Gravity in the frame of a pelvis that is level or tilted."""
+    load.gravity[0], load.gravity[1], load.gravity[2] = 0.0, 0.0, -gravity
+    if not is_level:
+        tilted = gravity_of(shown.imu_attitude[0], shown.imu_attitude[1], gravity)
+        load.gravity[0], load.gravity[1], load.gravity[2] = tilted
+
+
+@compiled
+def gravity_of(roll: float, pitch: float, gravity: float) -> tuple[float, float, float]:
+    """Gravity in the frame of a tilted pelvis [m/s²]."""
+    cosine = math.cos(pitch)
+    return gravity * math.sin(pitch), -gravity * (cosine * math.sin(roll)), -gravity * (cosine * math.cos(roll))

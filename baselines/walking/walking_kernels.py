@@ -1,0 +1,190 @@
+"""A control step of the walking controller, compiled, row by row; `baselines.walking.controller` has the formulas.
+
+Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
+file, and every size comes from a type. A kernel that Python calls takes plain tuples and names their parts itself.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from elastic_env.core.compiled import compiled
+from elastic_env.core.signals import Array
+
+
+def _row_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
+    return np.dtype((np.record, list(fields)))
+
+
+CONTROLLER = _row_type(
+    ("period_s", np.float64), ("is_com_fed_back", np.bool_),
+    ("thigh", np.float64), ("shank", np.float64), ("footholds", np.float64, (2, 2)),  # [m]
+    ("weight", np.float64), ("weight_of_feet", np.float64),  # of the robot, below the sensors [N]
+    ("omega", np.float64),  # of the pendulum [rad/s]
+    ("ankle_stiffness", np.float64, (2, 2)),  # pitch and roll of the legs [N·m/rad]
+    ("friction_deflection", np.float64, (2, 6)), ("friction_rate_rad_s", np.float64),  # [rad], [rad/s]
+    ("force_difference", np.float64), ("force_difference_decay_s", np.float64),
+    ("force_difference_limit_m", np.float64),
+    ("dcm", np.float64), ("zmp_limit_m", np.float64),
+    ("velocity_share", np.float64), ("zmp_share", np.float64), ("weight_share", np.float64),  # of a step in a period
+)  # fmt: skip
+"""What the controller assumes and its gains; shares are those that first-order filters make in one period."""
+
+PLAN = _row_type(("share", np.float64), ("com", np.float64, (2,)), ("com_dot", np.float64, (2,)))
+"""What it needs of the plan, one row per control step."""
+
+MEMORY = _row_type(
+    ("steps", np.float64), ("difference", np.float64),  # of the leg lengths [m]
+    ("com", np.float64, (2, 2)),  # from both soles [m]
+    ("velocity", np.float64, (2,)), ("shift", np.float64, (2,)),  # its deviation [m/s], ZMP shift [m]
+    ("following", np.float64, (2,)), ("planned", np.float64, (2,)),  # shift of the planned COM for a ZMP, and in all
+    ("weight", np.float64),  # as measured [N]
+)  # fmt: skip
+"""What the controller keeps of a world."""
+
+INPUTS = _row_type(
+    ("leg_length", np.float64), ("offset", np.float64, (2, 6)),  # [m], [rad]
+    ("balance_gain", np.float64), ("deflection", np.float64, (2, 6)),  # relative changes [1]
+)  # fmt: skip
+"""What something outside adds; zeros are as if there were none, to the last bit."""
+
+
+class Walk(NamedTuple):
+    """What does not change: row of `CONTROLLER`, rows of `PLAN`, share of the feedback in the first steps."""
+
+    controller: Any
+    plan: Any
+    ramp: Array
+
+
+class Seen(NamedTuple):
+    """Observations, rows with fields; center of mass, (n, 3), and soles, (n, 2, 3), in a level frame [m].
+
+    `shares` are the load shares of the right foot, (n,), or none to take those of the plan, (0,).
+    """
+
+    observed: Any
+    com: Array
+    soles: Array
+    shares: Array
+
+
+@compiled
+def control(walk: Any, seen: Any, inputs: Any, before: Any, now: Any, action: Array) -> None:
+    """Offsets of the joints, and the memory after a control step.
+
+    Args:
+        walk: `Walk`.
+        seen: `Seen`.
+        inputs: Rows of `INPUTS`, (n,).
+        before: Rows of `MEMORY`, (n,).
+        now: To be filled, but for `following` and `planned`, (n,).
+        action: To be filled, (n, 12) [rad].
+    """
+    walk, seen = Walk(*walk), Seen(*seen)
+    controller = walk.controller[0]
+    for world in range(len(now)):
+        shown, own, last, given = seen.observed[world], now[world], before[world], inputs[world]
+        row = int(min(max(np.rint(shown.clock[0] / controller.period_s) - 1.0, 0.0), len(walk.plan) - 1.0))
+        planned = walk.plan[row]
+        own.steps = last.steps + 1.0
+        ramp = walk.ramp[int(min(own.steps, len(walk.ramp) - 1.0))]
+        weigh(controller, shown, last, own)
+        share = planned.share if len(seen.shares) == 0 else seen.shares[world]
+        balance_feet(controller, shown, share, given.balance_gain, last, own)
+        for foot in range(2):
+            for i in range(2):
+                own.com[foot, i] = seen.com[world, i] - seen.soles[world, foot, i]
+        follow_com(controller, shown, planned, given.balance_gain, last, own)
+        for leg in range(2):
+            offset_leg(controller, shown, given, own, leg, ramp, action[world])
+
+
+@compiled
+def weigh(controller: Any, shown: Any, last: Any, own: Any) -> None:
+    """The weight as the feet show it, filtered; a share of zero keeps it."""
+    load = (vertical_force(shown, 0) + vertical_force(shown, 1)) + controller.weight_of_feet
+    own.weight = last.weight
+    if controller.weight_share > 0.0:
+        own.weight = last.weight + controller.weight_share * (load - last.weight)
+
+
+@compiled
+def vertical_force(shown: Any, foot: int) -> float:
+    """Along the normal of a sole, which is nearly vertical [N]."""
+    return shown.wrench[foot, 0, 2]
+
+
+@compiled
+def balance_feet(controller: Any, shown: Any, share: float, change: float, last: Any, own: Any) -> None:
+    """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
+    gain = (1.0 + change) * controller.force_difference
+    desired = (1.0 - 2.0 * share) * own.weight
+    missing = desired - (vertical_force(shown, 0) - vertical_force(shown, 1))
+    decay = last.difference / controller.force_difference_decay_s
+    difference = last.difference + controller.period_s * (gain * missing - decay)
+    own.difference = within(difference, controller.force_difference_limit_m)
+
+
+@compiled
+def follow_com(controller: Any, shown: Any, planned: Any, change: float, last: Any, own: Any) -> None:
+    """Filtered deviation of the COM velocity from the plan [m/s], and ZMP shift [m]."""
+    support = int(shown.clock[2])
+    for i in range(2):
+        own.velocity[i], own.shift[i] = last.velocity[i], last.shift[i]
+        if controller.is_com_fed_back:
+            now, before = own.com[support, i] - own.planned[i], last.com[support, i] - last.planned[i]
+            deviation = now + controller.footholds[support, i] - planned.com[i]
+            deviating = (now - before) / controller.period_s - planned.com_dot[i]
+            own.velocity[i] = last.velocity[i] + controller.velocity_share * (deviating - last.velocity[i])
+            error = deviation + own.velocity[i] / controller.omega
+            wanted = within((1.0 + change) * controller.dcm * error, controller.zmp_limit_m)
+            own.shift[i] = last.shift[i] + controller.zmp_share * (wanted - last.shift[i])
+
+
+@compiled
+def offset_leg(controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array) -> None:
+    """Offsets of the joints of a leg: its length, the torque of the ZMP shift, what is added, and friction [rad]."""
+    first, sign = 6 * leg, 1.0 - 2.0 * leg
+    difference = own.difference + given.leg_length
+    hip, knee, ankle = lengthening(controller, shown.reference_angle[first + 3], difference, sign)
+    share = shown.load_share if leg == 1 else 1.0 - shown.load_share
+    carried = share * controller.weight
+    pitch = carried * own.shift[0] / controller.ankle_stiffness[leg, 0]
+    roll = -carried * own.shift[1] / controller.ankle_stiffness[leg, 1]
+    for i in range(6):
+        wound = 1.0 + given.deflection[leg, i]
+        moved = 0.0
+        if i == 2:
+            moved = hip
+        elif i == 3:
+            moved = knee
+        elif i == 4:
+            moved = ankle + wound * pitch
+        elif i == 5:
+            moved = wound * roll
+        rate = shown.reference_rate[first + i] / controller.friction_rate_rad_s
+        against_friction = wound * (controller.friction_deflection[leg, i] * math.tanh(rate))
+        action[first + i] = ramp * (moved + given.offset[leg, i]) + against_friction
+
+
+@compiled
+def lengthening(controller: Any, knee: float, difference: float, sign: float) -> tuple[float, float, float]:
+    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference, or shorten it [rad].
+
+    The ankle stays on the line from the hip, and the sole keeps its attitude.
+    """
+    thigh, shank = controller.thigh, controller.shank
+    distance = math.sqrt(thigh**2 + shank**2 + 2.0 * thigh * shank * math.cos(knee))
+    bend = -distance / (thigh * shank * math.sin(knee)) * (0.5 * sign * difference)
+    at_hip = -bend * shank * (shank + thigh * math.cos(knee)) / distance**2
+    return at_hip, bend, -bend - at_hip
+
+
+@compiled
+def within(value: float, limit: float) -> float:
+    """A value within ±limit; what is no number stays so."""
+    if value > limit:
+        return limit
+    return -limit if value < -limit else value
