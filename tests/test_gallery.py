@@ -1,8 +1,11 @@
 """Known robots with elastic joints: stable, rigid in the limit, and of one gravity torque, whoever computes it."""
 
 import copy
+import csv
+import re
 import struct
 import xml.etree.ElementTree as ET
+from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
@@ -20,9 +23,11 @@ from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.make_elastic import make_elastic, transformed
 from elastic_env.joint.model_file import urdf_spec
 from elastic_env.joint.time_step import largest_stable_timestep
+from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.robots import gallery
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot, hinge_names, home_pose
 from tests.gallery_files import FOLDER, PACKAGED, excerpt
+from train.experiments.gallery import AtRest, measure
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")
 
@@ -133,7 +138,11 @@ def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
 def test_everybody_computes_the_same_gravity_torque(name: str) -> None:
     """Catches a mass, an axis or a frame that is lost between URDF, MuJoCo, Pinocchio and our tree."""
     model = rigid(name)
-    hinges, data, poses = hinge_names(model), mujoco.MjData(model), gallery.random_poses(model, seed=3, number=10)
+    hinges, data, poses = (
+        hinge_names(model),
+        mujoco.MjData(model),
+        gallery.random_poses(model, np.random.default_rng(3), 10),
+    )
     ours = TreeTorque(model, hinges).gravity_torque(poses)
     size = np.abs(ours).max()
     for pose, torque in zip(poses, ours, strict=True):
@@ -159,6 +168,57 @@ def from_urdf(name: str, hinges: list[str], pose: Array) -> Array:
     turn[at] = pose
     q = pinocchio.integrate(model, pinocchio.neutral(model), turn)
     return pinocchio.computeGeneralizedGravity(model, model.createData(), q)[at]
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def rows() -> dict[str, dict[str, str]]:
+    """What the page of the gallery shows."""
+    with (ROOT / "docs" / "results" / "gallery.csv").open(newline="", encoding="utf-8") as file:
+        return {row["robot"]: row for row in csv.DictReader(file)}
+
+
+@pytest.mark.parametrize("name", GALLERY)
+def test_the_figures_of_the_page_are_those_of_robots_at_rest(name: str) -> None:
+    """Catches figures that are old, and a pose in which MuJoCo's elastic robot would not rest."""
+    row = asdict(measure(name, FOLDER))
+    assert row.pop("input_rms_m") < 1e-9
+    for column, value in row.items():
+        found = rows()[name][column]
+        assert found == str(value) if isinstance(value, str) else float(found) == pytest.approx(value, rel=1e-4), column
+    robot, model = AtRest(name, FOLDER), elastic(name)
+    rotors, links = sides(model, robot.hinges)
+    data, q_ref = mujoco.MjData(model), gallery.random_poses(robot.model, np.random.default_rng(5), 3)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
+    for theta in (q_ref, robot.commands(q_ref)):
+        for motor, link in zip(theta, robot.links(theta), strict=True):
+            data.qpos[rotors], data.qpos[links] = motor, link
+            mujoco.mj_forward(model, data)
+            load = data.qfrc_bias[links]
+            np.testing.assert_allclose(data.qfrc_passive[links], load, rtol=0.0, atol=1e-9 * np.abs(load).max())
+
+
+def test_the_page_shows_every_robot() -> None:
+    """Catches a robot without a picture, or in the page and no longer in the gallery."""
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert list(rows()) == list(GALLERY)
+    assert set(re.findall(r"images/gallery/(\w+)\.png", page)) == set(GALLERY)
+    pictures = list((ROOT / "docs" / "images" / "gallery").iterdir())
+    assert {picture.stem for picture in pictures} == set(GALLERY)
+    assert sum(picture.stat().st_size for picture in pictures) < 500_000
+    assert all(f"`{name}`" in page for name in GALLERY)
+
+
+def test_rods_weigh_nothing() -> None:
+    """Catches a robot that is drawn by rods and gets heavier by them."""
+    spec = gallery_robot("panda", FOLDER)
+    add_simple_bodies(spec)
+    model = spec.compile()
+    np.testing.assert_array_equal(model.body_mass, rigid("panda").body_mass)
+    np.testing.assert_array_equal(model.body_inertia, rigid("panda").body_inertia)
+    assert model.ngeom > 5
+    assert not model.geom_contype.any()
 
 
 def test_the_excerpts_are_those_of_the_package() -> None:

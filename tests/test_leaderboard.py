@@ -221,7 +221,8 @@ def checkout() -> PageResults:
     results = Path("docs", "results")
     results.mkdir(parents=True)
     write_leaderboard(rows(), results)
-    shutil.copy(ROOT / "docs" / "results" / "demo_episodes.csv", results)
+    for table in ("demo_episodes.csv", "gallery.csv"):
+        shutil.copy(ROOT / "docs" / "results" / table, results)
     return PageResults.read(results)
 
 
@@ -240,6 +241,9 @@ def test_a_page_is_written_between_its_marks_and_nowhere_else() -> None:
     Path("other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ConfigurationError, match=r"other.csv is no leaderboard.csv: its columns must be track, policy"):
         read_leaderboard(Path("other.csv"))
+    Path("docs", "results", "gallery.csv").unlink()
+    with pytest.raises(ConfigurationError, match=r"gallery.csv is missing; python -m train.experiments.gallery"):
+        write_pages([])
     Path("docs", "results", "demo_episodes.csv").unlink()
     with pytest.raises(ConfigurationError, match=r"demo_episodes.csv is missing; copy it from runs/demo"):
         write_pages([])
@@ -260,11 +264,13 @@ def test_one_changed_number_changes_every_page_that_shows_it() -> None:
     assert found[0].base is not None
     base = replace(found[0].base, change=Estimate(-0.123, -0.2, -0.1))
     walks = [{**row, "pelvis_roll_peak_rad": row["pelvis_roll_peak_rad"] and "0.0777"} for row in results.walks]
-    changed = PageResults([replace(s, base=base) if s is found[0] else s for s in results.standings], walks)
+    gallery = [{**row, "uncompensated_peak_m": "0.0888"} for row in results.gallery]
+    changed = PageResults([replace(s, base=base) if s is found[0] else s for s in results.standings], walks, gallery)
     for page in pages(ROOT):
         text = page.read_text(encoding="utf-8")
         assert ("77.7" in page_with(text, changed)) == (page.name == "README.md")
-        assert "−12 %" in page_with(text, changed)
+        assert ("88.8" in page_with(text, changed)) == (page.name == "gallery.md")
+        assert ("−12 %" in page_with(text, changed)) == (page.name != "gallery.md")
 
 
 # The configuration.

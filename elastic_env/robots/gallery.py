@@ -45,9 +45,10 @@ class GalleryRobot:
     Attributes:
         title: Its name in full.
         file: Where its model lies, in the package or among Gymnasium's.
-        end_effector: Body whose origin is to be placed.
+        end_effector: Body that is to be placed.
         home: Angles that differ from zero in the pose about which it moves, by joint [rad].
         licence: Licence of its model.
+        tip: Which point of the end effector is to be placed, in its frame [m].
     """
 
     title: str
@@ -55,6 +56,7 @@ class GalleryRobot:
     end_effector: str
     home: Mapping[str, float] = field(default_factory=dict)
     licence: str = "BSD"
+    tip: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 _UR_HOME = {"shoulder_lift_joint": -0.9, "elbow_joint": 1.1, "wrist_1_joint": -0.4}
@@ -68,7 +70,7 @@ GALLERY: Mapping[str, GalleryRobot] = {
     "ur10": GalleryRobot("Universal Robots UR10", "ur_description/urdf/ur10_robot.urdf", "tool0", _UR_HOME),
     "kinova": GalleryRobot(
         "Kinova Jaco 2, 6 joints", "kinova_description/robots/kinova.urdf", "j2s6s200_end_effector",
-        {"j2s6s200_joint_2": 2.2, "j2s6s200_joint_3": 1.6, "j2s6s200_joint_5": 2.0},
+        {"j2s6s200_joint_1": 1.6, "j2s6s200_joint_2": 2.4, "j2s6s200_joint_3": 1.2, "j2s6s200_joint_5": 2.0},
     ),
     "xarm7": GalleryRobot(
         "UFACTORY xArm 7", "xarm_description/urdf/xarm7.urdf", "link_eef",
@@ -90,12 +92,9 @@ GALLERY: Mapping[str, GalleryRobot] = {
         "Rethink Baxter, both arms", "baxter_description/urdf/baxter.urdf", "right_gripper",
         {f"{side}_{joint}": angle for side in ("left", "right") for joint, angle in (("s1", -0.9), ("e1", 1.6))},
     ),
-    "two_dof": GalleryRobot(
-        "qbmove arm of two joints", "asr_twodof_description/urdf/TwoDofs.urdf", "Tip", {"J1": 0.5, "J2": 0.6}
-    ),
     "double_pendulum": GalleryRobot(
         "Double pendulum", "double_pendulum_description/urdf/double_pendulum.urdf", "link2",
-        {"joint1": 1.2, "joint2": 0.5},
+        {"joint1": 1.2, "joint2": 0.5}, tip=(0.0, 0.0, 0.22),
     ),
     "pusher": GalleryRobot(
         "Gymnasium's pusher, with gravity", "gymnasium/pusher_v5.xml", "tips_arm",

@@ -21,6 +21,7 @@ PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
 """Angle error of the pelvis that the paper reports in both gaits [mrad], its Figs. 7 and 8."""
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
+_SAGS = ("uncompensated_rms", "uncompensated_peak", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
 _SHORT = ("mixture", "held out")
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
@@ -32,14 +33,16 @@ class Results:
     Attributes:
         standings: Rows of the leaderboard.
         walks: Episodes of `elastic demo`, a column of `episodes.csv` by its name.
+        gallery: Robots of the gallery, a column of `gallery.csv` by its name.
     """
 
     standings: Sequence[Standing]
     walks: Sequence[Mapping[str, str]]
+    gallery: Sequence[Mapping[str, str]] = ()
 
     @classmethod
     def read(cls, folder: Path) -> "Results":
-        """From a folder with `leaderboard.csv` and `demo_episodes.csv`.
+        """From a folder with `leaderboard.csv`, `demo_episodes.csv` and `gallery.csv`.
 
         Raises:
             ConfigurationError: A table is missing, or not one of ours.
@@ -47,8 +50,15 @@ class Results:
         walks = folder / "demo_episodes.csv"
         if not walks.is_file():
             raise ConfigurationError(f"{walks} is missing; copy it from runs/demo/episodes.csv after `elastic demo`")
-        with walks.open(newline="", encoding="utf-8") as file:
-            return cls(read_leaderboard(folder / "leaderboard.csv"), list(csv.DictReader(file)))
+        gallery = folder / "gallery.csv"
+        if not gallery.is_file():
+            raise ConfigurationError(f"{gallery} is missing; python -m train.experiments.gallery writes it")
+        return cls(read_leaderboard(folder / "leaderboard.csv"), _rows(walks), _rows(gallery))
+
+
+def _rows(table: Path) -> list[dict[str, str]]:
+    with table.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def walks_beside_the_paper(results: Results) -> str:
@@ -74,11 +84,38 @@ def learning_in_short(results: Results) -> str:
     return markdown_table(head, ["---"] * 2 + ["---:"] * 2, rows) + "\n"
 
 
+def gallery_table(results: Results) -> str:
+    """How far the robots of the gallery sag, with and without compensation."""
+    rows = []
+    for row in results.gallery:
+        least, most = (float(row[f"stiffness_{which}_Nm_per_rad"]) for which in ("least", "most"))
+        deviations = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
+        rows.append(
+            [row["title"], row["joints"], f"{least:g} to {most:g}", row["stiffness_source"],
+             f"{1e3 * float(row['deflection_peak_rad']):.0f}", *deviations]
+        )  # fmt: skip
+    head = [
+        "robot", "joints", "K [N·m/rad]", "source of K", "largest deflection [mrad]", "sag [mm]", "largest sag",
+        "`input`", "sag, soft", "`input`, soft",
+    ]  # fmt: skip
+    return markdown_table(head, ["---", "---:", "---", "---", *["---:"] * 6], rows) + "\n"
+
+
+def gallery_pictures(results: Results) -> str:
+    """Pictures of the robots of the gallery, each under its name."""
+    return "\n".join(
+        f"**{row['title']}**\n\n![{row['title']} without and with compensation](images/gallery/{row['robot']}.png)\n"
+        for row in results.gallery
+    )
+
+
 PARTS: Mapping[str, Callable[[Results], str]] = {
     "leaderboard": lambda results: leaderboard_markdown(results.standings),
     "what learning adds": lambda results: claims_markdown(results.standings),
     "learning in short": learning_in_short,
     "walks beside the paper": walks_beside_the_paper,
+    "gallery": gallery_table,
+    "gallery pictures": gallery_pictures,
 }
 """Parts of pages by the name of their marks."""
 

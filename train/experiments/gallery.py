@@ -1,0 +1,205 @@
+"""The gallery of robots: how far they sag, with and without input compensation, and how that looks.
+
+    python -m train.experiments.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
+
+Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of the robot.
+"""
+
+import csv
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from elastic_env.rendering.headless import prefer_egl
+
+prefer_egl()
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+
+from baselines import PositionCompensator  # noqa: E402
+from elastic_env.core.signals import Array  # noqa: E402
+from elastic_env.dynamics.tree_torque import TreeTorque  # noqa: E402
+from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
+from elastic_env.rendering.picture import Image, set_stage  # noqa: E402
+from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402
+from elastic_env.robots.gallery import (  # noqa: E402
+    GALLERY,
+    gallery_joints,
+    gallery_robot,
+    hinge_names,
+    home_pose,
+    random_poses,
+)
+
+_SOFT = 0.7
+"""True stiffness over the assumed one in the scenario `soft`."""
+_SEED = 7
+_PIXELS, _COLOURS = 340, 64
+_ENLARGED = 8.0
+_REFERENCE, _REFERENCE_RGBA, _LINK_RGBA = "reference_", (0.3, 0.7, 0.45, 0.3), (1.0, 0.72, 0.42, 1.0)
+
+
+@dataclass(frozen=True)
+class Sag:
+    """A row of the table: deviations of the end effector over random poses at rest.
+
+    Attributes:
+        robot: Name in the gallery.
+        title: Name in full.
+        joints: Number of elastic joints.
+        stiffness_least_Nm_per_rad: K of the softest joint.
+        stiffness_most_Nm_per_rad: K of the stiffest joint.
+        stiffness_source: Where K comes from.
+        deflection_peak_rad: Largest deflection of a joint, uncompensated.
+        uncompensated_rms_m: Deviation without compensation.
+        uncompensated_peak_m: Its largest.
+        input_rms_m: With `input`, whose K is right.
+        soft_uncompensated_rms_m: Without, where the joints are 30 % softer than assumed.
+        soft_input_rms_m: With `input`, likewise.
+    """
+
+    robot: str
+    title: str
+    joints: int
+    stiffness_least_Nm_per_rad: float
+    stiffness_most_Nm_per_rad: float
+    stiffness_source: str
+    deflection_peak_rad: float
+    uncompensated_rms_m: float
+    uncompensated_peak_m: float
+    input_rms_m: float
+    soft_uncompensated_rms_m: float
+    soft_input_rms_m: float
+
+
+class AtRest:
+    """A robot of the gallery whose servos hold their angles.
+
+    Args:
+        name: As in `GALLERY`.
+        folder: Folder of the robots in place of that of the package.
+    """
+
+    def __init__(self, name: str, folder: Path | None = None) -> None:
+        self.name = name
+        self.model = gallery_robot(name, folder).compile()
+        self.joints = gallery_joints(name, folder)
+        self.hinges = hinge_names(self.model)
+        self.stiffness = np.array([self.joints[hinge].stiffness for hinge in self.hinges])
+        self._torque = TreeTorque(self.model, self.hinges)
+        self._compensator = PositionCompensator(self.model, self.stiffness.tolist())
+
+    def commands(self, q_ref: Array) -> Array:
+        """Commands of the input compensator, (..., n) [rad]."""
+        return np.apply_along_axis(self._compensator.command, -1, q_ref)
+
+    def links(self, theta: Array, softer: float = 1.0) -> Array:
+        """Where the links are for angles of the servos, (..., n) [rad]; `softer` is true over assumed stiffness."""
+        return static_link_angle(
+            theta, softer * self.stiffness, self._torque.gravity_torque, self._torque.gravity_gradient
+        )
+
+    def end_effector(self, q: Array) -> Array:
+        """Place of the end effector, from (m, n) [rad] to (m, 3) [m]."""
+        data, robot = mujoco.MjData(self.model), GALLERY[self.name]
+        body = data.body(robot.end_effector)
+        places = []
+        for pose in q:
+            data.qpos[:] = pose
+            mujoco.mj_kinematics(self.model, data)
+            places.append(body.xpos + body.xmat.reshape(3, 3) @ robot.tip)
+        return np.array(places)
+
+
+def measure(name: str, folder: Path | None = None) -> Sag:
+    """How far a robot sags; arguments as of `AtRest`."""
+    robot = AtRest(name, folder)
+    q_ref = random_poses(robot.model, np.random.default_rng(_SEED))
+    commands, wanted = robot.commands(q_ref), robot.end_effector(q_ref)
+
+    def deviation(theta: Array, softer: float) -> Array:
+        return np.linalg.norm(robot.end_effector(robot.links(theta, softer)) - wanted, axis=-1)
+
+    without = deviation(q_ref, 1.0)
+    return Sag(
+        robot=name, title=GALLERY[name].title, joints=len(robot.hinges),
+        stiffness_least_Nm_per_rad=float(robot.stiffness.min()),
+        stiffness_most_Nm_per_rad=float(robot.stiffness.max()),
+        stiffness_source="assumed",
+        deflection_peak_rad=float(np.abs(robot.links(q_ref) - q_ref).max()),
+        uncompensated_rms_m=_rms(without), uncompensated_peak_m=float(without.max()),
+        input_rms_m=_rms(deviation(commands, 1.0)),
+        soft_uncompensated_rms_m=_rms(deviation(q_ref, _SOFT)), soft_input_rms_m=_rms(deviation(commands, _SOFT)),
+    )  # fmt: skip
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def picture(name: str) -> Image:
+    """Home pose without and with compensation, side by side; deviations from the translucent reference are enlarged."""
+    robot = AtRest(name)
+    home = home_pose(name, robot.hinges)
+    spec = _display(name, _LINK_RGBA)
+    set_stage(spec, _PIXELS, _PIXELS)
+    spec.visual.headlight.diffuse = [0.45] * 3
+    spec.attach(_display(name, _REFERENCE_RGBA), prefix=_REFERENCE, frame=spec.worldbody.add_frame())
+    model = spec.compile()
+    data, views = mujoco.MjData(model), []
+    with mujoco.Renderer(model, _PIXELS, _PIXELS) as renderer:
+        for theta in (home, robot.commands(home)):
+            drawn = home + _ENLARGED * (robot.links(theta) - home)
+            for hinge, angle, reference in zip(robot.hinges, drawn, home, strict=True):
+                data.joint(hinge).qpos, data.joint(_REFERENCE + hinge).qpos = angle, reference
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera=_camera(model, data))
+            views.append(renderer.render().copy())
+    return np.concatenate(views, axis=1)
+
+
+def _display(name: str, rgba: Sequence[float]) -> mujoco.MjSpec:
+    """A robot to look at, in one colour."""
+    spec = gallery_robot(name, shapes=True)
+    for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+        spec.delete(geom)
+    if not any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in spec.geoms) and name != "pusher":
+        add_simple_bodies(spec)
+    for geom in spec.geoms:
+        geom.rgba, geom.material = rgba, ""
+    return spec
+
+
+def _camera(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjvCamera:
+    """A view from the side that holds the whole robot."""
+    radius = model.geom_rbound[:, None]
+    low, high = (data.geom_xpos - radius).min(axis=0), (data.geom_xpos + radius).max(axis=0)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = (low + high) / 2.0
+    camera.distance = 1.15 * float(np.linalg.norm(high - low))
+    camera.azimuth, camera.elevation = 125.0, -15.0
+    return camera
+
+
+def write(checkout: Path) -> None:
+    """The table and all pictures, under docs of a checkout."""
+    import PIL.Image
+
+    docs = checkout / "docs"
+    rows = [asdict(measure(name)) for name in GALLERY]
+    with (docs / "results" / "gallery.csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, rows[0], lineterminator="\n")
+        table.writeheader()
+        table.writerows(
+            {column: f"{cell:.6g}" if isinstance(cell, float) else cell for column, cell in row.items()} for row in rows
+        )
+    (docs / "images" / "gallery").mkdir(exist_ok=True)
+    for name in GALLERY:
+        image = PIL.Image.fromarray(picture(name)).quantize(_COLOURS)
+        image.save(docs / "images" / "gallery" / f"{name}.png", optimize=True)
+
+
+if __name__ == "__main__":
+    write(Path(*sys.argv[1:2]))
