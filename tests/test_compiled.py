@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 KERNELS = (
     "elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels",
     "elastic_env.dynamics.tree_kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.end_effector",
-    "baselines.compensation.contact_kernels", "baselines.walking.walking_kernels",
+    "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
 )  # fmt: skip
 
 

@@ -73,9 +73,10 @@ class OnlineStiffness(PolicyAround):
     def _adapted(self, rows: Array, memory: Array) -> Array:
         """Memory after a control step: a new target where one is due, and the filtered correction."""
         memory, n = memory.copy(), self._n
-        steps, target, filtered, kept = np.split(memory, [1, 1 + n, 1 + 2 * n], axis=1)
+        steps, target, filtered = memory[:, :1], memory[:, 1 : 1 + n], memory[:, 1 + n : 1 + 2 * n]
         due = np.flatnonzero(steps[:, 0] % self._every == 0)
         if len(due):
+            kept = memory[:, 1 + 2 * n :]
             wanted, kept[due] = self._estimator.estimate(rows[due], kept[due])
             target[due] = np.clip(wanted, -self._limit, self._limit)
         filtered += self._gain * (target - filtered)

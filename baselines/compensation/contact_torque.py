@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from baselines.compensation import contact_kernels as kernels
+from baselines.compensation import compensation_kernels as kernels
 from baselines.compensation.observed import ObservedWalk
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.leg_chains import LegChains
@@ -163,8 +163,6 @@ class BoundPlannedTorque:
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  the interface's
         """Torque at joint angles near the reference, (num_worlds, 12) [rad] to [N·m]."""
-        if np.array_equal(q, self.q_ref):
-            return self.torque
         return self.torque + (self.gravity.gravity_torque(q) - self.gravity.gravity_torque(self.q_ref))
 
 

@@ -9,6 +9,7 @@ Columns per joint are in the order of the robot's joints. Axes: x forward, y to 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -92,14 +93,14 @@ class PolicyInputs:
     posture_gain: Array | None = None
     balance_gain: Array | None = None
 
-    @property
+    @cached_property
     def is_empty(self) -> bool:
         """Whether no input is used."""
         return all(getattr(self, field.name) is None for field in fields(self))
 
     def with_deflection(self, correction: Array | None) -> "PolicyInputs":
         """The same with another relative change of the deflection."""
-        return replace(self, deflection=correction)
+        return self if correction is self.deflection else replace(self, deflection=correction)
 
     @property
     def zmp_shift(self) -> Array | None:

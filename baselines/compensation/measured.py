@@ -10,11 +10,9 @@ closed chain, and δ follows the command by as much as the command changes. The 
 instead, which `baselines.adaptation` corrects slowly by what is measured.
 """
 
-import copy
-
 import numpy as np
 
-from baselines.compensation.compensators import Compensator, Motion
+from baselines.compensation.compensators import Compensator, Motion, alike
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 from elastic_env.runtime.robot_model import RobotModel
@@ -84,7 +82,7 @@ class MeasuredCompensator:
 
     def at(self, rows: Array) -> "MeasuredCompensator":
         """See `Compensator`."""
-        bound = copy.copy(self)
+        bound = alike(self)
         bound._base, bound._deflection = self._base.at(rows), self._sensors.deflection(rows)
         return bound
 

@@ -201,7 +201,7 @@ def taken_up(
     memory, inner_state = state
     if len(memory) != len(rows):
         raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {len(memory)}")
-    if episode_start is not None and np.any(episode_start):
+    if episode_start is not None and np.count_nonzero(episode_start) > 0:
         fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
         memory = np.where(fresh[:, None], begin(), memory)
     return memory, inner_state

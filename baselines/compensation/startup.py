@@ -29,6 +29,8 @@ class Ramp:
     def __init__(self, model: RobotModel, duration_s: float) -> None:
         self._duration = max(duration_s, model.control_period_s)
         self._period_s = model.control_period_s
+        self._whole = int(np.argmax(self.is_over(np.arange(np.ceil(self._duration / self._period_s) + 2.0))))
+        """Number of steps from which on the compensation is complete."""
         self._delay = 0.0
         if isinstance(model, WalkerModel):
             half_period = np.pi / sway_frequencies(model.biped, model.plan.pelvis[0], _held_stiffness(model))[0]
@@ -37,8 +39,8 @@ class Ramp:
 
     def share(self, steps: Array) -> Array:
         """Share after a number of control steps, elementwise."""
-        if self.is_over(steps).all():
-            return np.ones_like(steps)
+        if steps.min(initial=np.inf) >= self._whole:
+            return np.ones(steps.shape)
         time, each = steps * self._period_s, self._duration - self._delay
         return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 

@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 
 from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.observed import ObservedWalk
 from baselines.compensation.policy import Action, ObservationView, PolicyAround, predicted, taken_up
 from baselines.compensation.startup import Ramp
+from baselines.walking.walking_kernels import POSTURE, POSTURE_MEMORY, hold_posture
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.contact_force import shares
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -61,13 +62,20 @@ class PostureFeedback(PolicyAround):
     def __init__(
         self, policy: Any, model: WalkerModel, gains: PostureGains | None = None, ramp_s: float = STAND_S
     ) -> None:
-        self._policy, self._gains = policy, gains or PostureGains()
-        table, self._dt = model.observation_table, model.control_period_s
-        self._view = ObservationView(table, self._dt)
-        self._attitude, self._rate = table.group("imu_attitude"), table.columns("imu_rate.x", "imu_rate.y")
-        self._share_right = table.group("load_share")
-        self._filter = 1.0 - float(np.exp(-self._dt / self._gains.filter_s))
+        self._policy, gains, period_s = policy, gains or PostureGains(), model.control_period_s
+        self._view, self._observed = (
+            ObservationView(model.observation_table, period_s),
+            ObservedWalk(model.observation_table),
+        )
         self._ramp = Ramp(model, ramp_s)
+        values = {
+            **gains.model_dump(),
+            "period_s": period_s,
+            "integral_limit": gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf,
+            "filter_share": 1.0 - float(np.exp(-period_s / gains.filter_s)),
+            "swing_share": period_s / max(gains.swing_s, period_s),
+        }
+        self._gains: Any = np.array([tuple(values[name] for name in POSTURE.names or ())], POSTURE)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -84,49 +92,17 @@ class PostureFeedback(PolicyAround):
     ) -> tuple[Action, Any]:
         """See `PolicyWithInputs`; it takes `posture_gain`."""
         rows = self._view.rows(observation)
-        begun = np.zeros((len(rows), 7))
-        memory, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
-        others = replace(inputs, posture_gain=None)
+        memory, inner = taken_up(
+            state, episode_start, rows, self._view, lambda: np.zeros((len(rows), POSTURE_MEMORY.itemsize // 8))
+        )
+        others = inputs if inputs.posture_gain is None else replace(inputs, posture_gain=None)
         action, inner = predicted(self._policy, observation, others, inner, episode_start, deterministic)
-        turn, tilts = self._turned(rows, memory[:, :5], inputs.posture_gain)
-        pitch, kept = self._pitch_of_legs(rows, turn[:, 1:], memory[:, 5:])
-        offsets = hip_offsets(np.stack([np.repeat(turn[:, :1], 2, axis=1), pitch], axis=-1))
-        total = np.asarray(action, dtype=np.float64) + offsets.reshape(np.shape(action))
-        return total.astype(np.float32), (np.hstack([tilts, kept]), inner)
-
-    def _turned(self, rows: Array, memory: Array, change: Array | None) -> tuple[Array, Array]:
-        """Turn of both hips against roll and pitch, (num_worlds, 2) [rad], and the new memory.
-
-        Args:
-            rows: Observations.
-            memory: That of the last step.
-            change: Relative change of all gains, (num_worlds, 1) [1]; the integral itself goes on as it is.
-        """
-        gains = self._gains
-        steps, tilt, integral = memory[:, :1] + 1.0, memory[:, 1:3], memory[:, 3:5]
-        tilt = tilt + self._filter * (rows[:, self._attitude] - tilt)
-        integral = integral + self._dt * (tilt - integral / gains.leak_s)
-        most = gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
-        integral = np.clip(integral, -most, most)
-        turn = gains.proportional * tilt + gains.integral * integral + gains.derivative * rows[:, self._rate]
-        if change is not None:
-            turn = (1.0 + change) * turn
-        turn = self._ramp.share(steps) * np.clip(turn, -gains.limit_rad, gains.limit_rad)
-        return turn, np.hstack([steps, tilt, integral])
-
-    def _pitch_of_legs(self, rows: Array, turn: Array, kept: Array) -> tuple[Array, Array]:
-        """Hip pitch of left and right leg, and what a leg in the air would keep, both (num_worlds, 2) [rad].
-
-        Args:
-            rows: Observations.
-            turn: That of standing legs, (num_worlds, 1) [rad].
-            kept: As returned before.
-        """
-        # a leg that carries half of the weight stands
-        standing = np.minimum(2.0 * shares(rows[:, self._share_right][:, 0]), 1.0)
-        pitch = kept + standing * (turn - kept)
-        following = np.where(standing < 1.0, self._dt / max(self._gains.swing_s, self._dt), 1.0)
-        return pitch, kept + following * (turn - kept)
+        total, kept = np.array(action, dtype=np.float64, ndmin=2), np.empty(memory.shape)
+        share = self._ramp.share(memory[:, :1] + 1.0)
+        change = np.zeros(share.shape) if inputs.posture_gain is None else np.ascontiguousarray(inputs.posture_gain)
+        before, now = (np.ndarray(len(rows), POSTURE_MEMORY, np.ascontiguousarray(part)) for part in (memory, kept))
+        hold_posture(self._gains, self._observed.fields(rows), share, change, (before, now), total)
+        return total.astype(np.float32).reshape(np.shape(action)), (kept, inner)
 
 
 def hip_offsets(turn: Array) -> Array:

@@ -1,4 +1,6 @@
-"""A control step of the walking controller, compiled, row by row; `baselines.walking.controller` has the formulas.
+"""A control step of walking controller and posture feedback, compiled, row by row.
+
+`baselines.walking.controller` and `baselines.walking.posture` have the formulas.
 
 Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
 file, and every size comes from a type. A kernel that Python calls takes plain tuples and names their parts itself.
@@ -48,6 +50,20 @@ INPUTS = _row_type(
     ("balance_gain", np.float64), ("deflection", np.float64, (2, 6)),  # relative changes [1]
 )  # fmt: skip
 """What something outside adds; zeros are as if there were none, to the last bit."""
+
+POSTURE = _row_type(
+    ("period_s", np.float64),
+    ("proportional", np.float64), ("integral", np.float64), ("derivative", np.float64),  # [1], [1/s], [s]
+    ("leak_s", np.float64), ("limit_rad", np.float64), ("integral_limit", np.float64),  # the last one [rad·s]
+    ("filter_share", np.float64), ("swing_share", np.float64),  # of a step in a period [1]
+)  # fmt: skip
+"""Gains of the posture feedback."""
+
+POSTURE_MEMORY = _row_type(
+    ("steps", np.float64), ("tilt", np.float64, (2,)), ("integral", np.float64, (2,)),  # roll and pitch [rad], [rad·s]
+    ("kept", np.float64, (2,)),  # hip pitch that either leg keeps [rad]
+)  # fmt: skip
+"""What the posture feedback keeps of a world."""
 
 
 class Walk(NamedTuple):
@@ -188,3 +204,43 @@ def within(value: float, limit: float) -> float:
     if value > limit:
         return limit
     return -limit if value < -limit else value
+
+
+@compiled
+def hold_posture(gains: Any, observed: Any, ramp: Array, change: Array, memory: Any, action: Array) -> None:
+    """Add the turn of the hips against the pelvis' tilt, and keep the memory after a control step.
+
+    Args:
+        gains: Row of `POSTURE`, (1,).
+        observed: Observations, rows with fields.
+        ramp: Share of the feedback, (n, 1) [1].
+        change: Relative change of all gains, (n, 1) [1]; the integral itself goes on as it is.
+        memory: Rows of `POSTURE_MEMORY` before, and to be filled, (n,).
+        action: Offsets of the joints, (n, 12) [rad].
+    """
+    before, now = memory
+    own = gains[0]
+    for world in range(len(action)):
+        shown, last, kept = observed[world], before[world], now[world]
+        kept.steps = last.steps + 1.0
+        for i in range(2):
+            tilt = last.tilt[i] + own.filter_share * (shown.imu_attitude[i] - last.tilt[i])
+            integral = last.integral[i] + own.period_s * (tilt - last.integral[i] / own.leak_s)
+            kept.tilt[i], kept.integral[i] = tilt, within(integral, own.integral_limit)
+            turn = own.proportional * tilt + own.integral * kept.integral[i] + own.derivative * shown.imu_rate[i]
+            turn = ramp[world, 0] * within((1.0 + change[world, 0]) * turn, own.limit_rad)
+            for leg in range(2):
+                if i == 0:
+                    action[world, 6 * leg + 1] += turn
+                else:
+                    action[world, 6 * leg + 2] += pitch_of_leg(own, shown.load_share, leg, turn, last, kept)
+
+
+@compiled
+def pitch_of_leg(own: Any, share_right: float, leg: int, turn: float, last: Any, kept: Any) -> float:
+    """Hip pitch of a leg [rad]: one that carries half of the weight stands and turns, one in the air follows slowly."""
+    share = share_right if leg == 1 else 1.0 - share_right
+    standing = min(2.0 * share, 1.0)
+    following = own.swing_share if standing < 1.0 else 1.0
+    kept.kept[leg] = last.kept[leg] + following * (turn - last.kept[leg])
+    return last.kept[leg] + standing * (turn - last.kept[leg])

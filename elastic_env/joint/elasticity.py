@@ -110,7 +110,8 @@ def static_deflection(torque: Array, stiffness: Parameter, backlash: Parameter =
     Returns:
         δ = θ − q, (..., n) [rad]; positive where the motor side leads.
     """
-    return torque / stiffness + np.sign(torque) * np.asarray(backlash) / 2.0
+    wound = torque / stiffness
+    return wound if isinstance(backlash, float) and backlash == 0.0 else wound + np.sign(torque) * backlash / 2.0
 
 
 def static_link_angle(

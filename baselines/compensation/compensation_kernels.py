@@ -1,4 +1,6 @@
-"""What loads the legs of a walker in a control step, compiled, row by row; see `baselines.compensation.contact_torque`.
+"""What compensators compute in a control step, compiled, row by row.
+
+Loads of the legs: see `baselines.compensation.contact_torque`. Lead of the motors: see `DynamicCompensator`.
 
 Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
 file, and every size comes from a type.
@@ -26,6 +28,20 @@ CONTACT = np.dtype(
     )
 )
 """How the ground carries the robot."""
+
+DRIVE = np.dtype(
+    (
+        np.record,
+        [
+            ("damping", np.float64),  # D [N·m·s/rad]
+            ("rotor_inertia", np.float64),  # B [kg·m²]
+            ("position_gain", np.float64),  # [N·m/rad]
+            ("velocity_gain", np.float64),  # [N·m·s/rad]
+            ("integral_gain", np.float64),  # [N·m/(rad·s)]
+        ],
+    )
+)
+"""Rotor, damper and servo of a joint."""
 
 
 @compiled
@@ -90,3 +106,42 @@ def gravity_of(roll: float, pitch: float, gravity: float) -> tuple[float, float,
     """Gravity in the frame of a tilted pelvis [m/s²]."""
     cosine = math.cos(pitch)
     return gravity * math.sin(pitch), -gravity * (cosine * math.sin(roll)), -gravity * (cosine * math.cos(roll))
+
+
+@compiled
+def lead(drives: Any, period_s: float, stiffness: Array, motion: Any, loads: Any, memory: Any, offset: Array) -> None:
+    """By how much motors lead under their loads, and the memory after a control period.
+
+    Args:
+        drives: Rows of `DRIVE`, one per joint, (n,).
+        period_s: Control period [s].
+        stiffness: K of the worlds, (worlds, n), or of all, (1, n) [N·m/rad].
+        motion: Rates and accelerations of the links, (worlds, n) each [rad/s], [rad/s²].
+        loads: Joint torque [N·m], and the deflection at rest under it [rad], (worlds, n) each.
+        memory: Deflections, their rates and integrals of the servo errors, (worlds, at least 3 n), before and to be
+            filled.
+        offset: To be filled, (worlds, n) [rad].
+    """
+    (q_dot, q_ddot), (torque, settled), (before, now), n = motion, loads, memory, len(drives)
+    for world in range(len(offset)):
+        K = stiffness[min(world, len(stiffness) - 1)]
+        for i in range(n):
+            drive, last, load = drives[i], before[world, i], torque[world, i]
+            deflection = lagging(last, settled[world, i], drive.damping / K[i], period_s)
+            rate = (deflection - last) / period_s
+            acceleration = (rate - before[world, n + i]) / period_s
+            theta_dot, theta_ddot = q_dot[world, i] + rate, q_ddot[world, i] + acceleration
+            effort = drive.rotor_inertia * theta_ddot + load + drive.velocity_gain * theta_dot
+            windup, error = 0.0, effort / drive.position_gain
+            if drive.integral_gain > 0.0:  # k_p e + k_i ∫e = effort
+                time_s = drive.position_gain / drive.integral_gain
+                windup = lagging(before[world, 2 * n + i], effort / drive.integral_gain, time_s, period_s)
+                error = (effort - drive.integral_gain * windup) / drive.position_gain
+            offset[world, i] = deflection + error - 0.5 * period_s * theta_dot  # it is held too early
+            now[world, i], now[world, n + i], now[world, 2 * n + i] = deflection, rate, windup
+
+
+@compiled
+def lagging(state: float, target: float, time_constant_s: float, period_s: float) -> float:
+    """State of a first-order lag after one period towards a constant target; no lag for a time constant of zero."""
+    return target + math.exp(-period_s / time_constant_s) * (state - target)
