@@ -2,6 +2,7 @@
 
 import errno
 import os
+import platform
 import subprocess
 import sys
 import threading
@@ -90,7 +91,7 @@ with locked(Path(sys.argv[1])):
 
 
 def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -> None:
-    """Catches two --resume of one run at once, and a lock that outlives its program."""
+    """Catches two --resume of one run at once, a lock that outlives its program, and one that nobody waits for."""
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         cwd=Path(__file__).parents[1],
@@ -98,14 +99,24 @@ def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with (
-            pytest.raises(ConfigurationError, match=f"another program, process {other.pid}, works on"),
+            pytest.raises(ConfigurationError, match=f"another program, process {other.pid} of .*, works on"),
             locked(tmp_path),
         ):
             pass
-        other.kill()
+        seed = tmp_path / "seed_3"
+        seed.mkdir()
+        with (
+            pytest.raises(ConfigurationError, match=r"process \d+ of .*, works on .*seed_3"),
+            locked(seed),
+            locked(seed),
+        ):
+            pass
+        threading.Timer(0.3, other.kill).start()
+        with locked(tmp_path, patience_s=60.0):
+            pass
         other.wait()
         with locked(tmp_path):
-            assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+            assert (tmp_path / ".lock").read_text() == f"{os.getpid()} of {platform.node()}\n"
 
 
 def test_a_run_that_is_resumed_runs_no_code_of_its_folder(tmp_path: Path) -> None:
@@ -114,5 +125,5 @@ def test_a_run_that_is_resumed_runs_no_code_of_its_folder(tmp_path: Path) -> Non
     text = (Path(__file__).parents[1] / "configs" / "train_testbed.yaml").read_text()
     (tmp_path / "config.yaml").write_text(f"algorithm: evil:Algorithm\n{text}")
     with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code"):
-        resume(tmp_path, Console(quiet=True))
+        resume([tmp_path], Console(quiet=True))
     assert not (tmp_path / "ran").exists()

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import yaml
 from gymnasium.vector import AutoresetMode
+from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import baselines
@@ -31,11 +32,14 @@ from train.evaluate.progress import read_progress
 from train.experiments.bench import BenchCase
 from train.learn.constant_search import ConstantSearch
 from train.learn.mixed_env import MixedVectorEnv, threads_of_each
+from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.scores import played_together
 from train.learn.state import read_state, write_state
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Training
+from train.runs.folders import locked
+from train.workers.places import Place
 
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
@@ -470,6 +474,46 @@ def test_train_command_trains_every_seed_and_resumes(
     with Path("e/episodes.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["link_error_rms_rad"]) > 0.0
+
+
+def test_several_configurations_are_trained_in_one_pool(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches configurations that wait for one another, a seed in the folder of another, a resume of one alone."""
+    monkeypatch.chdir(tmp_path)
+    pools, opened = list[int](), Place.opened
+    monkeypatch.setattr(Place, "opened", lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder))
+    configs = {name: {"name": name, **SMALL, **PPO, "base": base} for name, base in (("a", "input"), ("b", "dynamic"))}
+    for name, config in configs.items():
+        Path(f"{name}.yaml").write_text(yaml.safe_dump(config))
+    main(["train", "a.yaml", "b.yaml", "--seeds", "3", "--decisions", "64", "--jobs", "2", "--output", "both"])
+    assert pools == [2]
+    for name in configs:
+        description, _ = load_residual(Path(f"both/{name}/seed_3/last"))
+        assert description.base == configs[name]["base"]
+    capsys.readouterr()
+    main(["train", "--resume", "both/a", "both/b"])
+    said = capsys.readouterr().out
+    assert "both/a is complete" in said
+    assert "both/b is complete" in said
+
+
+def test_a_training_seed_that_another_program_trains_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches two programs that write into one folder, where a lock of the whole run does not reach."""
+    config = TrainConfig(**{**SMALL, **PPO, "seeds": [3]})
+    monkeypatch.setattr("train.learn.run_training._PATIENCE_S", 0.0)
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    (tmp_path / "run" / "seed_3").mkdir(parents=True)
+    (tmp_path / "run" / "config.yaml").write_text(Path("c.yaml").read_text())
+    with (
+        locked(tmp_path / "run" / "seed_3"),
+        pytest.raises(ConfigurationError, match=rf"process {os.getpid()} of .* works on .*run/seed_3"),
+    ):
+        resume([tmp_path / "run"], Console(quiet=True))
+    assert {path.name for path in (tmp_path / "run" / "seed_3").iterdir()} == {".lock"}
 
 
 @pytest.mark.parametrize(

@@ -16,20 +16,21 @@ class Train:
     """Train a residual on top of a base policy, for every training seed of a configuration.
 
     Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train --resume runs/NAME.
-    A run keeps, for every seed, checkpoint/ to go on from, best/ and last/ as policies, which elastic evaluate and
-    compare take as residual:PATH, progress.csv, and files for TensorBoard.
+    The seeds of several configurations share the workers: elastic train a.yaml b.yaml --jobs 4.
+    Each configuration has a run of its own. It keeps, for every seed, checkpoint/ to go on from, best/ and last/ as
+    policies, which elastic evaluate and compare take as residual:PATH, progress.csv, and files for TensorBoard.
     """
 
-    config: Annotated[Path | None, tyro.conf.Positional] = None
-    """Configuration; those in configs/train_*.yaml are examples."""
-    resume: Path | None = None
-    """Folder of a run to go on with."""
+    config: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Configurations, one or more; those in configs/train_*.yaml are examples."""
+    resume: tuple[Path, ...] = ()
+    """Folders of runs to go on with."""
     seeds: list[int] | None = None
-    """Training seeds instead of the configuration's."""
+    """Training seeds instead of the configurations' own."""
     decisions: int | None = None
-    """Decisions of all worlds together instead of the configuration's."""
+    """Decisions of all worlds together instead of the configurations' own."""
     output: Path | None = None
-    """Folder for the run, new or empty; default runs/<name>, numbered if taken."""
+    """Folder for the run, new or empty, or for the folders of several; default runs/<name>, numbered if taken."""
     trust_code: bool = False
     """With --resume: run the code that the run's algorithm names, where it is none of Stable-Baselines3's."""
     jobs: int = 1
@@ -39,11 +40,11 @@ class Train:
 
     def run(self) -> None:
         """Train, or go on with it."""
-        if (self.config is None) == (self.resume is None):
-            raise ConfigurationError("name either a configuration or, with --resume, the run to go on with")
+        if bool(self.config) == bool(self.resume):
+            raise ConfigurationError("name either configurations or, with --resume, the runs to go on with")
         given = {"seeds": self.seeds, "decisions": self.decisions}
         changes = {name: value for name, value in given.items() if value is not None}
-        if self.resume is not None and (changes or self.output is not None):
+        if self.resume and (changes or self.output is not None):
             raise ConfigurationError(
                 "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
             )
@@ -52,14 +53,15 @@ class Train:
         from train.workers.places import Place
 
         place = Place(self.on, self.jobs)
-        if self.resume is not None:
-            folder = resume(self.resume, CONSOLE, place, self.trust_code)
+        if self.resume:
+            folders = resume(self.resume, CONSOLE, place, self.trust_code)
         else:
-            config = load_yaml(self.config, TrainConfig)  # type: ignore[arg-type]
+            configs = [load_yaml(file, TrainConfig) for file in self.config]
             with options_named():
-                config = config.replace(**changes)
-            folder = start(config, CONSOLE, self.output, place)
-        CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
+                configs = [config.replace(**changes) for config in configs]
+            folders = start(configs, CONSOLE, self.output, place)
+        for folder in folders:
+            CONSOLE.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
 
 
 @dataclass

@@ -1,6 +1,8 @@
-"""`elastic train`: the training seeds of a configuration, in turn or side by side, resumable at any moment."""
+"""`elastic train`: the training seeds of configurations, in turn or side by side, resumable at any moment."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -13,47 +15,83 @@ from train.evaluate.environments import environment
 from train.evaluate.progress import read_progress
 from train.learn.train_config import CONSTANTS, TrainConfig
 from train.learn.trainer import Trainer
-from train.runs.folders import CONFIG, locked, run_folder
+from train.runs.folders import CONFIG, locked, locked_part, require_name, run_folder
 from train.runs.progress import Show, show_progress
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.places import Place
 
 ONE_BY_ONE = Place(jobs=1)
 """Seeds in turn, in this process, with all cores for the physics of each."""
+_PATIENCE_S = 60.0
+"""How long the program that works on a training seed is waited for."""
 
 
-def start(config: TrainConfig, console: Console, output: Path | None = None, place: Place = ONE_BY_ONE) -> Path:
-    """Train all seeds of a configuration in a new run.
+@dataclass(frozen=True)
+class Run:
+    """A configuration and the folder of its training."""
+
+    config: TrainConfig
+    folder: Path
+
+    def lacks(self) -> list[int]:
+        """Training seeds that have not come to their end."""
+        return [seed for seed in self.config.seeds if not _is_complete(self.folder / f"seed_{seed}")]
+
+
+def start(
+    configs: Sequence[TrainConfig], console: Console, output: Path | None = None, place: Place = ONE_BY_ONE
+) -> list[Path]:
+    """Train all seeds of some configurations, each in a new run.
 
     Args:
-        config: What is trained.
+        configs: What is trained.
         console: Where progress and results go.
-        output: Folder, new or empty; default runs/<name>, numbered if taken.
+        output: Folder, new or empty; of several configurations each has a folder in it by its name. Default
+            runs/<name>, numbered if taken.
         place: Where seeds are trained, and how many at a time; the weights do not depend on it.
 
     Returns:
-        The run's folder; there is none where nothing could begin.
+        The runs' folders; there is none where nothing could begin.
 
     Raises:
         ConfigurationError: Names or options that do not exist.
         ResultsExistError: The output folder holds results.
     """
-    with run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], output) as folder, locked(folder):
-        return _train(config, folder, console, place)
+    runs = list[Run]()
+    with ExitStack() as held:
+        for config in configs:
+            own = output if output is None or len(configs) == 1 else output / require_name(config.name)
+            made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
+            runs.append(Run(config, held.enter_context(made)))
+            held.enter_context(locked(runs[-1].folder))
+        _train(runs, console, place)
+    return [run.folder for run in runs]
 
 
-def resume(folder: Path, console: Console, place: Place = ONE_BY_ONE, trust_code: bool = False) -> Path:
-    """Go on with a run that was interrupted or killed; seeds that are complete stay as they are.
+def resume(
+    folders: Sequence[Path], console: Console, place: Place = ONE_BY_ONE, trust_code: bool = False
+) -> list[Path]:
+    """Go on with runs that were interrupted or killed; seeds that are complete stay as they are.
 
     Args:
-        folder: Of the run.
+        folders: Of the runs.
         console: Where progress and results go.
         place: Where seeds are trained, and how many at a time.
-        trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may lie in the folder.
+        trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may lie in a folder.
 
     Raises:
-        ConfigurationError: The folder is no training run, another program works on it, or its algorithm is not trusted.
+        ConfigurationError: A folder is no training run, another program works on it, or its algorithm is not trusted.
     """
+    runs = [Run(_recorded(folder, trust_code), folder) for folder in folders]
+    with ExitStack() as held:
+        for run in runs:
+            held.enter_context(locked(run.folder))
+        _train(runs, console, place)
+    return [run.folder for run in runs]
+
+
+def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
+    """The configuration of a run that is gone on with."""
     if not (folder / CONFIG).is_file():
         raise ConfigurationError(f"{folder} is no training run: it has no {CONFIG}; name the folder that train printed")
     config = load_yaml(folder / CONFIG, TrainConfig)
@@ -63,31 +101,47 @@ def resume(folder: Path, console: Console, place: Place = ONE_BY_ONE, trust_code
                 f"{folder / CONFIG} names {what} of its own, {name!r}, whose code would run; look at it, then say "
                 "--trust-code"
             )
-    with locked(folder):
-        return _train(config, folder, console, place)
+    return config
 
 
-def _train(config: TrainConfig, folder: Path, console: Console, place: Place) -> Path:
-    if all(_is_complete(folder / f"seed_{seed}") for seed in config.seeds):
-        console.print(f"{folder} is complete; to learn for longer, start a new run with --decisions", soft_wrap=True)
-    else:
-        console.print(f"training in {folder}; if it stops: elastic train --resume {folder}", soft_wrap=True)
-    with show_progress(console, {f"seed {seed}": config.decisions for seed in config.seeds}) as show:
-        if place == ONE_BY_ONE:
-            for number, seed in enumerate(config.seeds):
-                _train_seed(config, seed, folder, 0, partial(show, number))
+def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
+    for run in runs:
+        if run.lacks():
+            console.print(f"training in {run.folder}; if it stops: elastic train --resume {run.folder}", soft_wrap=True)
         else:
-            _train_beside(config, folder, console, place, show)
-    console.print(_table(config, folder))
-    return folder
+            said = f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
+            console.print(said, soft_wrap=True)
+    calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
+    with show_progress(console, {call.name: call.run.config.decisions for call in calls}) as show:
+        if place == ONE_BY_ONE:
+            for number, call in enumerate(calls):
+                _train_seed(call.run.config, call.seed, call.run.folder, 0, partial(show, number))
+        else:
+            _train_beside(calls, console, place, show)
+    for run in runs:
+        console.print(_table(run.config, run.folder))
 
 
-def _train_beside(config: TrainConfig, folder: Path, console: Console, place: Place, show: Show) -> None:
+@dataclass(frozen=True)
+class _Call:
+    """A training seed of a run."""
+
+    run: Run
+    seed: int
+    is_one_of_several: bool
+
+    @property
+    def name(self) -> str:
+        """What progress calls it."""
+        return f"{self.run.folder.name}, seed {self.seed}" if self.is_one_of_several else f"seed {self.seed}"
+
+
+def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: Show) -> None:
     """Train seeds beside each other, with one thread each: they share the cores among them.
 
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
     """
-    done, note = [0] * len(config.seeds), ""
+    done, note = [0] * len(calls), ""
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
@@ -98,30 +152,35 @@ def _train_beside(config: TrainConfig, folder: Path, console: Console, place: Pl
         note = tally.in_words("seeds")
 
     def moved(number: int) -> None:
-        console.print(f"a worker was lost; seed {config.seeds[number]} goes on from its checkpoint", soft_wrap=True)
+        console.print(f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True)
 
-    calls = [(config, seed, folder.resolve(), 1) for seed in config.seeds]
+    given = [(call.run.config, call.seed, call.run.folder.resolve(), 1) for call in calls]
     watch = Watch(reported=report, tallied=tallied, moved=moved)
-    with place.opened(len(calls), folder) as pool:
-        outcomes = run_calls(_train_seed, calls, pool, watch, finishes=False)
-    _raise_first(config, outcomes)
+    with place.opened(len(given), calls[0].run.folder) as pool:
+        outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
+    _raise_first(calls, outcomes)
 
 
-def _raise_first(config: TrainConfig, outcomes: Sequence[Outcome | None]) -> None:
+def _raise_first(calls: Sequence[_Call], outcomes: Sequence[Outcome | None]) -> None:
     """The first error of a seed, when the others have ended."""
-    for seed, outcome in zip(config.seeds, outcomes, strict=True):
+    for call, outcome in zip(calls, outcomes, strict=True):
         if outcome is not None and outcome.error is not None:
-            outcome.error.add_note(f"in the training of seed {seed}; the other seeds have ended")
+            outcome.error.add_note(f"in the training of {call.name}; the other seeds have ended")
             raise outcome.error
 
 
 def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, report: Callable[[int], None]) -> None:
+    """Train a seed, or go on with it.
+
+    A worker that has lost its scheduler ends within some seconds. Another one, which takes its seed over, waits for it.
+    """
     own = folder / f"seed_{seed}"
     report(0)
-    if not _is_complete(own):
-        training = _trainer(config)(config, seed, own, threads)
-        report(training.done)
-        training.run(lambda done: report(min(done, config.decisions)))
+    with locked_part(own, _PATIENCE_S):
+        if not _is_complete(own):
+            training = _trainer(config)(config, seed, own, threads)
+            report(training.done)
+            training.run(lambda done: report(min(done, config.decisions)))
     report(config.decisions)
 
 

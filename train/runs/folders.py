@@ -7,12 +7,13 @@ import json
 import os
 import platform
 import subprocess
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import yaml
 
@@ -24,7 +25,7 @@ RUNS = Path("runs")
 
 CONFIG = "config.yaml"
 """File of a run with its resolved configuration."""
-_LOCK = ".lock"
+_LOCK, _RETRY_S = ".lock", 0.2
 _PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
 
 
@@ -103,25 +104,52 @@ def require_name(name: str) -> str:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Keep other programs from a run for as long as this one works on it; a kill frees it.
+
+    Args:
+        folder: Of the run.
+        patience_s: How long another program is waited for [s].
 
     Raises:
         ConfigurationError: Another program works on it.
     """
     with (folder / _LOCK).open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            raise ConfigurationError(
-                f"another program, process {file.read().strip() or 'unknown'}, works on {folder}; wait until it has "
-                "ended, or end it"
-            ) from None
+        last = time.monotonic() + patience_s
+        while not _is_taken(file):
+            if time.monotonic() >= last:
+                file.seek(0)
+                raise ConfigurationError(
+                    f"another program, process {file.read().strip() or 'unknown'}, works on {folder}; wait until it "
+                    "has ended, or end it"
+                )
+            time.sleep(_RETRY_S)
         file.truncate(0)
-        file.write(f"{os.getpid()}\n")
+        file.write(f"{os.getpid()} of {platform.node()}\n")
         file.flush()
         yield
+
+
+def _is_taken(lock: TextIO) -> bool:
+    """Whether a lock could be taken for this program."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+@contextmanager
+def locked_part(folder: Path, patience_s: float) -> Iterator[None]:
+    """`locked` for a part of a run, whose folder is made; it goes again if the work fails without a result."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder, patience_s):
+        try:
+            yield
+        except BaseException:
+            if set(folder.iterdir()) == {folder / _LOCK}:
+                _remove(folder, [_LOCK])
+            raise
 
 
 @contextmanager
