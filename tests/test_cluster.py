@@ -1,10 +1,12 @@
 """Cells beside each other: kept by their content, moved when a worker is lost, the same wherever they are played."""
 
+import errno
 import os
 import signal
-import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,42 +16,32 @@ import pytest
 from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
+from tests.cluster_trials import SINE, dask_cluster, free_port
+from tests.test_training import PPO, SMALL, weights
 from train.cells.key import cell_key
 from train.cells.play import run_conditions
 from train.cells.store import Store
+from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import Evaluation, evaluate
+from train.learn.run_training import start
+from train.learn.train_config import TrainConfig
+from train.learn.training import Training
+from train.runs.whole import flush
 from train.workers.calls import Watch, WorkerKilledError, run_calls
 from train.workers.places import Place
 from train.workers.versions import VersionsDifferError, require_same
 
-SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 CONDITIONS = [
     Condition(policy=PolicySpec(name=name), reference=SINE, episodes=2) for name in ("uncompensated", "input")
 ]
 
 
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
 @pytest.fixture
-def dask(tmp_path: Path) -> Iterator[Place]:
-    """A scheduler and two workers, real processes over TCP."""
-    port, program = free_port(), str(Path(sys.executable).parent / "dask")
-    address, quiet = f"tcp://127.0.0.1:{port}", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    commands = [["scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]] + [
-        ["worker", address, "--nthreads", "1", "--no-dashboard", "--local-directory", str(tmp_path / str(n))]
-        for n in range(2)
-    ]
-    known = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}  # the functions of this file
-    started = [subprocess.Popen([program, *command], env=known, **quiet) for command in commands]  # type: ignore[call-overload]
-    yield Place(f"dask://127.0.0.1:{port}")
-    for process in reversed(started):
-        process.terminate()
-        process.wait()
+def dask() -> Iterator[Place]:
+    """A scheduler and two workers."""
+    with dask_cluster(2) as (place, _):
+        yield place
 
 
 def killed_once(mark: str, report: Callable[[int], None]) -> int:
@@ -157,3 +149,84 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypat
         Place(f"dask://127.0.0.1:{port}").opened(1, tmp_path),
     ):
         pass
+
+
+COMPARED = """
+name: cells
+env: testbed
+references: [{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}]
+policies: [uncompensated, input, dynamic]
+"""
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_takes_no_more_keeps_the_cells_before(
+    code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a cell that is half written and used, cells that go with the failure, and a traceback."""
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text(COMPARED)
+    main(["compare", "c.yaml", "--output", "whole", "--jobs", "1"])
+    flushed, kept = flush, Path("run/cells")
+
+    def full(path: Path) -> None:
+        if path.parent == kept and len(list(kept.glob("*.npz"))) == 2:
+            raise OSError(code, os.strerror(code))
+        flushed(path)
+
+    monkeypatch.setattr("train.runs.whole.flush", full)
+    with pytest.raises(SystemExit) as caught:
+        main(["compare", "c.yaml", "--output", "run", "--jobs", "1"])
+    said = capsys.readouterr().err
+    assert caught.value.code == 3
+    assert f".npz: {os.strerror(code)}; " in said
+    assert "finished cells are kept; go on with: elastic compare --resume run" in said
+    assert "Traceback" not in said
+    assert [file.suffix for file in kept.iterdir()] == [".npz"] * 2
+    monkeypatch.setattr("train.runs.whole.flush", flushed)
+    main(["compare", "--resume", "run"])
+    assert "2 of 3 cells are kept" in capsys.readouterr().out
+    for name in ("episodes.csv", "statistics.csv"):
+        assert Path("run", name).read_bytes() == Path("whole", name).read_bytes()
+
+
+UNGUARDED = """
+from pathlib import Path
+from rich.console import Console
+from train.cells.play import run_conditions
+from train.evaluate.conditions import Condition, PolicySpec
+print("run", flush=True)
+run_conditions([Condition(policy=PolicySpec(name=name)) for name in ("uncompensated", "input")], Console())
+"""
+
+
+def test_a_script_whose_processes_import_it_is_told_so(tmp_path: Path) -> None:
+    """Catches an EOFError of a process that says nothing, and tracebacks of the processes."""
+    (tmp_path / "script.py").write_text(UNGUARDED)
+    run = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 1
+    assert run.stdout == "run\nrun\n"
+    assert run.stderr.count("Traceback") == 1
+    assert 'must do so below if __name__ == "__main__":' in run.stderr.splitlines()[-1]
+
+
+def test_a_training_seed_whose_worker_is_killed_ends_with_the_same_weights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a seed that begins anew, or goes on from another state, where another worker takes it over."""
+    config = TrainConfig(**{**SMALL, **PPO, "seeds": [3], "decisions": 384})
+    own = tmp_path / "run" / "seed_3"
+
+    def kill() -> None:
+        while not (own / "checkpoint").exists():
+            time.sleep(0.01)
+        os.kill(int((own / ".lock").read_text().split()[0]), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    start([config], Console(), tmp_path / "run", Place(jobs=2))
+    killer.join()
+    assert "a worker was lost; seed 3 goes on from its checkpoint" in capsys.readouterr().out
+    Training(config, 3, tmp_path / "alone").run()
+    for name, tensor in weights(tmp_path / "alone" / "last").items():
+        np.testing.assert_array_equal(tensor, weights(own / "last")[name], err_msg=name)

@@ -341,7 +341,7 @@ def _played(
             console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
         raise
     except (KeyboardInterrupt, SystemFailedError, OSError) as error:
-        if (folder / CELLS).is_dir():
+        if any((folder / CELLS).glob("*.npz")):
             error.add_note(f"finished cells are kept; {go_on}")
         raise
 

@@ -12,15 +12,17 @@ def write_whole(path: Path, content: bytes) -> None:
         content: Its content.
 
     Raises:
-        OSError: The disk is full or the folder cannot be written.
+        OSError: The disk is full or the folder cannot be written; it names the file.
     """
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         fresh.write_bytes(content)
         flush(fresh)
         fresh.rename(path)
-    except BaseException:
+    except BaseException as error:
         fresh.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)
         raise
     flush(path.parent)
 

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import queue
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -41,7 +42,7 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
     with _ctrl_c_held():
-        manager.start(_follow_parent)
+        _start(manager)
     with manager:
         reports = manager.Queue()
         processes = Processes(min(jobs or os.cpu_count() or 1, calls), context)
@@ -56,6 +57,23 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
         processes.shutdown()
         reports.put(None)
         pump.join()
+
+
+def _start(manager: SyncManager) -> None:
+    """Start the first process.
+
+    Raises:
+        ConfigurationError: It ended at once: it imports the script that runs here, which starts processes itself.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        sys.exit(1)  # this is that process; the one that started it says why
+    try:
+        manager.start(_follow_parent)
+    except EOFError:
+        raise ConfigurationError(
+            "a process ended while it started; a script that starts processes must do so below "
+            'if __name__ == "__main__": since each of them imports the script'
+        ) from None
 
 
 class Processes(Executor):
