@@ -260,7 +260,14 @@ FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>
         (ARM, 0.0, {}, r"stiffness of turn must be > 0 \[N·m/rad\], got 0"),
         (ARM, -5, {}, "must be > 0"),
         (ARM, math.nan, {}, "must be > 0"),
-        (ARM, "1000", {}, "must be a number"),
+        (ARM, "1000", {}, r"stiffness must be numbers .*, got '1000'; give a number for all joints"),
+        (ARM, None, {}, "stiffness is missing; give a number for all joints"),
+        (
+            ARM,
+            {"*": {"stifness": 9.0}},
+            {},
+            r"stiffness of joint 'turn' is missing beside .*'stifness'.*'stiffness: K'",
+        ),
         (ARM, True, {}, "must be a number"),
         (ARM, [1.0, 2.0], {}, "stiffness must be 3 numbers.*of turn, shoulder, elbow, got 2"),
         (ARM, 900.0, {"position_gain": {"*": None}}, "position_gain of turn must be a number"),
@@ -274,6 +281,7 @@ FIXED = "<mujoco><worldbody><body><geom size='0.1'/></body></worldbody></mujoco>
         (TENDON, 900.0, {}, "tendons with stiffness"),
         (FREE, 900.0, {}, "'root' is free or a ball joint"),
         (FIXED, 900.0, {}, "no hinge"),
+        (FIXED.replace("<geom", "<joint/><geom"), 900.0, {}, "a hinge of the model has no name; give each one"),
     ],
 )
 def test_models_and_values_that_cannot_be_used_are_refused(
@@ -290,11 +298,25 @@ def test_a_gripper_with_constraints_of_its_own_is_held() -> None:
     assert compensator.joints == ("turn", "shoulder", "elbow")
 
 
+MESH = """<mujoco><asset><mesh name="m" file="{}"/></asset><worldbody><body><joint name="a"/>
+  <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+LINK = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass value="{}"/>
+  <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="a" type="continuous"><parent link="base"/><child link="arm"/></joint></robot>"""
+
+
 def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
-    """Catches a traceback of MuJoCo or of an XML parser."""
+    """Catches a traceback of MuJoCo or of an XML parser, and a message that does not say what to do."""
+    (tmp_path / "there.dae").write_text("<COLLADA/>")
+    with pytest.raises(ConfigurationError, match="a model must be a file, an MjSpec or an MjModel, got None"):
+        PositionCompensator.from_model(None, 900.0)  # type: ignore[arg-type]
     for text, message in (
         (None, "no model at"), ("{", "is no XML"), ("<mujoco><bdy/></mujoco>", "MuJoCo cannot read"),
-        ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "MuJoCo cannot compile.*mass"),
+        ("<mujoco><worldbody><body><joint name='a'/></body></worldbody></mujoco>", "cannot compile.*needs a mass"),
+        (MESH.format("lost.stl"), "cannot compile.*lost.stl.*; put the mesh where the model names it"),
+        (MESH.format("there.dae"), "cannot compile.*there.dae.*; MuJoCo reads meshes of STL, OBJ and MSH"),
+        (LINK.format("0"), "cannot compile.*; every link that moves needs a mass"),
+        (LINK.format("heavy"), "cannot read.*mass.*; it must be a number"),
     ):  # fmt: skip
         path = tmp_path / "m.xml"
         if text is not None:

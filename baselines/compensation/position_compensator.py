@@ -33,6 +33,7 @@ _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
 _MOST_ITERATIONS = 50
 _FILES = (".yaml", ".yml")
+_HOW_TO_GIVE = "give a number for all joints, one per joint, a mapping by name, or a YAML file (.yaml) of that"
 _factored, _solved = get_lapack_funcs(("getrf", "getrs"))  # without the checks of lu_factor, which take longer
 
 
@@ -251,6 +252,8 @@ def _hinges(model: mujoco.MjModel) -> list[str]:
     names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
     if not names:
         raise ConfigurationError("the model has no hinge; a compensator needs a robot with rotary joints")
+    if not all(names):
+        raise ConfigurationError("a hinge of the model has no name; give each one, the stiffness is by name")
     return names
 
 
@@ -297,8 +300,12 @@ def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> N
 
 def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
     """Positive numbers of all joints, (n,) [N·m/rad]."""
+    if given is None:
+        raise ConfigurationError(f"{name} is missing; {_HOW_TO_GIVE}")
     if isinstance(given, Mapping):
         values = [_of_joint(name, given, joint) for joint in joints]
+    elif isinstance(given, str | Path):
+        raise ConfigurationError(f"{name} must be numbers [N·m/rad], got {shown(str(given))}; {_HOW_TO_GIVE}")
     elif isinstance(given, list | tuple | np.ndarray):
         values = list(given)
         if len(values) != len(joints):
@@ -331,7 +338,13 @@ def _of_joint(name: str, given: Mapping[str, Any], joint: str) -> Any:
             "joint. It is measured by a known torque and the deflection under it"
         )
     value = given[joint if joint in given else fitting[-1]]
-    return value.get("stiffness") if isinstance(value, Mapping) and name == "stiffness" else value
+    if not isinstance(value, Mapping) or name != "stiffness":
+        return value
+    if "stiffness" not in value:
+        raise ConfigurationError(
+            f"stiffness of joint {joint!r} is missing beside {shown(list(value))}; write 'stiffness: K' [N·m/rad]"
+        )
+    return value["stiffness"]
 
 
 def _number(name: str, value: Any, unit: str, least: float | None = None, finite: bool = True) -> float:

@@ -5,9 +5,17 @@ from pathlib import Path
 
 import mujoco
 
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 
 _LARGEST_BYTES = 50_000_000
+_CURES = {
+    "mass and inertia of moving bodies": "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero",
+    "inertia must": "the inertia must be that of a body: positive, and no main value above the sum of the other two",
+    "Error opening file": "put the mesh where the model names it, or take its shape out and give the link's inertia",
+    "no decoder found": "MuJoCo reads meshes of STL, OBJ and MSH; convert it, or take its shape out",
+    "bad format in attribute": "it must be a number",
+}
+"""What to do about errors of MuJoCo, by a part of their text."""
 _SHAPES, _READABLE = ("visual", "collision"), (".stl", ".obj")
 
 
@@ -26,6 +34,8 @@ def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujo
         return model
     if isinstance(model, mujoco.MjSpec):
         return _compiled(model, "the specification")
+    if not isinstance(model, str | Path):
+        raise ConfigurationError(f"a model must be a file, an MjSpec or an MjModel, got {shown(model)}")
     path = Path(model)
     if not path.is_file():
         raise ConfigurationError(f"no model at {path}; give a file of MJCF (.xml) or URDF (.urdf)")
@@ -39,7 +49,7 @@ def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujo
         is_urdf = root.tag == "robot"
         spec = urdf_spec(root) if is_urdf else mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot read {path}: {error}") from None
+        raise ConfigurationError(f"MuJoCo cannot read {path}: {_with_cure(error)}") from None
     return _compiled(spec, str(path))
 
 
@@ -98,4 +108,10 @@ def _compiled(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot compile {name}: {error}") from None
+        raise ConfigurationError(f"MuJoCo cannot compile {name}: {_with_cure(error)}") from None
+
+
+def _with_cure(error: ValueError) -> str:
+    """MuJoCo's error in one line, and what to do about it where that is known."""
+    text = ", ".join(line.strip() for line in str(error).splitlines() if line.strip())
+    return "; ".join([text, *(cure for part, cure in _CURES.items() if part in text)])
