@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.estimation.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver, _least_squares
+from baselines.estimation.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver
+from baselines.estimation.estimation_kernels import update
 from elastic_env.core.signals import Array
 
 
@@ -107,15 +108,16 @@ def test_least_squares_are_those_of_a_batch() -> None:
     generator, expected = np.random.default_rng(1), np.random.default_rng(2).normal(0.0, 0.04, size=40)
     excess = 0.4 * expected + 0.01 + generator.normal(0.0, DISAGREEMENT_RAD, size=40)
     valid = generator.random(40) < 0.7
-    x, P = np.zeros((1, 2)), np.diag([MODEL_ERROR**2, OFFSET_RAD**2])[None]
-    for s, e, v in zip(expected, excess, valid, strict=True):
-        x, P = _least_squares(x, P, np.array([s]), np.array([e]), np.array([v]))
+    x, upper = np.zeros(2), np.array([MODEL_ERROR**2, 0.0, OFFSET_RAD**2])
+    for s, e in zip(expected[valid], excess[valid], strict=True):
+        update(x, upper, s, s + e, DISAGREEMENT_RAD)
+    P = upper[[[0, 1], [1, 2]]]
     rows = np.stack([expected, np.ones(40)], axis=1)[valid] / DISAGREEMENT_RAD
     rows = np.vstack([rows, np.diag([1.0 / MODEL_ERROR, 1.0 / OFFSET_RAD])])
     sought = np.concatenate([excess[valid] / DISAGREEMENT_RAD, [0.0, 0.0]])
-    np.testing.assert_allclose(x[0], np.linalg.lstsq(rows, sought, rcond=None)[0], rtol=1e-9)
-    np.testing.assert_allclose(P[0], np.linalg.inv(rows.T @ rows), rtol=1e-9)
-    assert stats.norm.sf(abs(x[0, 0] - 0.4) / np.sqrt(P[0, 0, 0])) > 1e-3
+    np.testing.assert_allclose(x, np.linalg.lstsq(rows, sought, rcond=None)[0], rtol=1e-9)
+    np.testing.assert_allclose(P, np.linalg.inv(rows.T @ rows), rtol=1e-9)
+    assert stats.norm.sf(abs(x[0] - 0.4) / np.sqrt(P[0, 0])) > 1e-3
 
 
 def test_unloaded_feet_say_nothing() -> None:

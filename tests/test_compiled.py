@@ -29,6 +29,7 @@ KERNELS = (
     "elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels",
     "elastic_env.dynamics.tree_kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.end_effector",
     "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
+    "baselines.estimation.estimation_kernels",
 )  # fmt: skip
 
 
@@ -209,3 +210,31 @@ def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, m
     for k in range(20):
         worlds.step(np.full((2, 12), 0.01 * np.sin(k), dtype=np.float32))
     assert steps == 20
+
+
+PLAYED = """
+import gymnasium, numpy as np, baselines, elastic_env
+env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="nominal")
+walk = [baselines.make("adaptive_posture", env, base=base) for base in ("input_output", "dynamic")]
+(row, _), start = env.reset(seed=3), True
+states = [None, None]
+for step in range(6):
+    steps = [policy.predict(row, state, start) for policy, state in zip(walk, states)]
+    states, start = [state for _, state in steps], False
+    row = env.step(steps[0][0])[0]
+    print(*[float(x) for action, _ in steps for x in action], *[float(x) for state in states for x in state[0][0]])
+"""
+
+
+def test_compiled_policies_do_what_their_python_code_says() -> None:
+    """Catches a policy's code that is compiled to something else, and what was compiled before a change."""
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", PLAYED], check=True, capture_output=True, text=True,
+            env={**os.environ, "NUMBA_DISABLE_JIT": switch},
+        ).stdout
+        for switch in "01"
+    ]  # fmt: skip
+    compiled_ones, plain = (np.array([line.split() for line in text.splitlines()], dtype=np.float64) for text in said)
+    assert compiled_ones.shape == (6, 38)
+    np.testing.assert_allclose(compiled_ones, plain, rtol=1e-7, atol=1e-12)

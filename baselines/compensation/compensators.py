@@ -136,6 +136,7 @@ class GravityCompensator:
         require_known("output compensator", [output], get_args(OutputMethod))
         self.model = model
         self.stiffness, self._servo_compliance = model.stiffness, model.servo_compliance
+        self._per_deflection = 1.0 + self.stiffness * self._servo_compliance
         self.gravity = self._load = make_gravity(model, method)
         """τ_g of the desired posture and of the measured one."""
         self._source, self._load_source = self.gravity, make_load(model, output, self.gravity)
@@ -158,7 +159,7 @@ class GravityCompensator:
 
     def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
         """See `Compensator`: all of the offset but what the servo itself gives way."""
-        return offset / (1.0 + self.stiffness * self._servo_compliance)
+        return offset / self._per_deflection
 
     def link_angle(self, theta: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
         """See `Compensator`."""
@@ -217,7 +218,8 @@ class DynamicCompensator:
     def at(self, rows: Array) -> "DynamicCompensator":
         """See `Compensator`."""
         bound = alike(self)
-        bound._static, bound._body = self._static.at(rows), self._source.at(rows)
+        bound._static = self._static.at(rows)
+        bound._body = self._source.at(rows, bound._static.gravity)
         return bound
 
     def with_stiffness(self, stiffness: Array) -> "DynamicCompensator":

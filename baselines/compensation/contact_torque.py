@@ -145,12 +145,12 @@ class PlannedTorque:
         self._time = model.observation_table.group("clock")
         self._reference = model.observation_table.group("reference_angle")
 
-    def at(self, rows: Array) -> "BoundPlannedTorque":
-        """The torque at the control steps of observations, (num_worlds, m)."""
+    def at(self, rows: Array, gravity: LegTorque | None = None) -> "BoundPlannedTorque":
+        """The torque at the control steps of observations, (num_worlds, m); `gravity` is the static one, if known."""
         plan = self._model.plan
-        row = np.round(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
-        torque = plan.torque[np.clip(row, 0, plan.num_steps)]
-        return BoundPlannedTorque(torque, rows[:, self._reference], self._gravity.at(rows))
+        row = np.rint(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
+        torque = plan.torque[np.minimum(np.maximum(row, 0), plan.num_steps)]
+        return BoundPlannedTorque(torque, rows[:, self._reference], gravity or self._gravity.at(rows))
 
 
 @dataclass(frozen=True)

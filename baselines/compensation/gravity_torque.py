@@ -49,7 +49,7 @@ class FixedDynamics:
         body = HingeTorque(model) if _is_plain_hinge(model) else TreeTorque(model.rigid, model.joint_names)
         self.inverse_dynamics = body.inverse_dynamics
 
-    def at(self, rows: Array) -> "FixedDynamics":  # noqa: ARG002  a walker's
+    def at(self, rows: Array, gravity: Any = None) -> "FixedDynamics":  # noqa: ARG002  a walker's
         """Itself."""
         return self
 

@@ -16,7 +16,9 @@ squares over the time that a foot is loaded tell ρ from c, for roll and pitch o
 import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
-from elastic_env.core.signals import Array, BoolArray, Signal
+from baselines.compensation.observed import ObservedWalk
+from baselines.estimation.estimation_kernels import ESTIMATE, regress
+from elastic_env.core.signals import Array, Signal
 from elastic_env.dynamics.leg_kernels import sole_tilts
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -28,7 +30,7 @@ MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
 _UNKNOWNS = 2  # ρ and c
 _SHAPE = (2, 2)  # legs, roll and pitch
 _FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"))
-_ESTIMATE, _VARIANCES = 8, 12  # per world: (legs, axes, unknowns) and (legs, axes, upper triangle)
+_VARIANCES = 12  # per world: (legs, axes, upper triangle)
 
 
 class BendingObserver:
@@ -50,13 +52,13 @@ class BendingObserver:
         for filtered in filters
     )
     """What `observe` returns."""
-    memory_width = _ESTIMATE + _VARIANCES
+    memory_width = ESTIMATE.itemsize // 8
 
     def __init__(self, model: WalkerModel) -> None:
         self._model, self._compensator = model, GravityCompensator(model, output="wrench")
         table = model.observation_table
         self._theta, self._attitude = table.group("encoder_angle"), table.group("imu_attitude")
-        self._wrench = table.group("wrench")
+        self._observed = ObservedWalk(table)
         self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
 
     def begin(self, num_worlds: int) -> Array:
@@ -74,17 +76,12 @@ class BendingObserver:
             memory: (num_worlds, memory_width).
             bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under the foot wrenches.
         """
-        n = len(rows)
-        force = rows[:, self._wrench].reshape(n, 2, 2, 3)[:, :, 0]
-        loaded: BoolArray = np.asarray(force[..., 2] >= LOADED_SHARE * self._carried)
-        estimate, variances = np.split(memory, [_ESTIMATE], axis=1)
         seen, expected = self.disagreement(rows, self.bending(rows) if bending is None else bending)
-        x, P = estimate.reshape(n, *_SHAPE, _UNKNOWNS), _symmetric(variances.reshape(n, *_SHAPE, 3))
-        x, P = _least_squares(x, P, expected, seen - expected, loaded[..., None])
-        upper = P[..., *np.triu_indices(_UNKNOWNS)].reshape(n, -1)
-        excess = force[..., 2].sum(axis=1, keepdims=True) / self._carried - 1.0
-        deviation = np.sqrt(P[..., 0, 0].reshape(n, -1))
-        return np.hstack([x[..., 0].reshape(n, -1), deviation, excess]), np.hstack([x.reshape(n, -1), upper])
+        kept, found = np.empty(memory.shape), np.empty((len(rows), len(self.signals)))
+        before, now = (np.ndarray(len(rows), ESTIMATE, np.ascontiguousarray(part)) for part in (memory, kept))
+        least = self._carried, LOADED_SHARE * self._carried, DISAGREEMENT_RAD
+        regress(self._observed.fields(rows), (seen, expected), least, (before, now), found)
+        return found, kept
 
     def bending(self, rows: Array) -> Array:
         """Expected bending of the joints under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
@@ -110,17 +107,3 @@ class BendingObserver:
         seen, expected = np.empty((2, len(rows), *_SHAPE))
         sole_tilts(self._model.biped.chains.axis, q, attitude, bent, seen, expected)
         return seen, expected
-
-
-def _symmetric(upper: Array) -> Array:
-    first, mixed, second = np.moveaxis(upper, -1, 0)
-    return np.stack([np.stack([first, mixed], axis=-1), np.stack([mixed, second], axis=-1)], axis=-2)
-
-
-def _least_squares(x: Array, P: Array, expected: Array, excess: Array, valid: BoolArray) -> tuple[Array, Array]:
-    """One step of recursive least squares for excess = ρ · expected + c, where it is valid."""
-    h = np.stack([expected, np.ones_like(expected)], axis=-1)
-    Ph = (P @ h[..., None])[..., 0]
-    gain = Ph / ((h * Ph).sum(axis=-1) + DISAGREEMENT_RAD**2)[..., None] * valid[..., None]
-    x = x + gain * (excess - (h * x).sum(axis=-1))[..., None]
-    return x, P - gain[..., :, None] * Ph[..., None, :]
