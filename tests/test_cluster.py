@@ -151,6 +151,25 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypat
         pass
 
 
+OTHER_NUMPY = """
+from importlib import metadata
+
+real = metadata.version  # this file may be loaded twice
+metadata.version = lambda name, real=real: "1.0.7" if name == "numpy" else real(name)
+"""
+
+
+def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
+    """Catches versions of workers that nobody looks at."""
+    (tmp_path / "other.py").write_text(OTHER_NUMPY)
+    with (
+        dask_cluster(1, "--no-nanny", "--preload", str(tmp_path / "other.py")) as (place, _),
+        pytest.raises(VersionsDifferError, match=r"on tcp://.*: numpy 1\.0\.7 there, .* here; install the same commit"),
+        place.opened(1, tmp_path),
+    ):
+        pass
+
+
 COMPARED = """
 name: cells
 env: testbed
