@@ -26,6 +26,7 @@ from elastic_env.joint.make_elastic import transformed
 from elastic_env.motion.references import AnyReference, make_reference
 from elastic_env.registration import Robot, require_models
 from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
+from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.joint_config import JointConfig, RewardWeights, require_torque
 from elastic_env.runtime.joint_task import JointPlant, JointTask
@@ -188,7 +189,17 @@ class JointPicture(ModelPicture):
             geom.rgba = _REFERENCE_RGBA
         spec.attach(reference, prefix=_REFERENCE, frame=spec.worldbody.add_frame())
         super().__init__(spec, (("translucent: reference", (0.27, 0.55, 0.37, 1.0)),))
-        self._task, self._joints = task, list(robot.joints)
+        self._robot, self._task, self._joints = robot, task, list(robot.joints)
+
+    def alone(self) -> Alone:
+        """See `HasSides`."""
+        extent = self._robot.rigid().compile().stat.extent
+        return Alone(self._robot.rigid(), self._joints, (1.5 * extent, 0.0, 0.0))
+
+    def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002  the truth has every joint
+        """See `HasSides`."""
+        truth = self._task.truth()
+        return Sides(self._task.sample().q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
 
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the truth has every joint
         q, q_ref = self._task.truth().q[world], self._task.sample().q_ref[world]

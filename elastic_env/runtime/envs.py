@@ -67,6 +67,11 @@ class _Faces:
         """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
         return self._worlds.task.truth()
 
+    @property
+    def picture(self) -> Picture:
+        """What draws the worlds, made when it is first asked for."""
+        return self._draw()
+
     def __getstate__(self) -> dict[str, Any]:
         """Everything but window and renderer, which are made again when they are needed."""
         return {**vars(self), "_picture": None}

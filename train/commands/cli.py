@@ -1,4 +1,4 @@
-"""The command `elastic`: identify, evaluate, compare, train, iterate, export, bench, speed, play, hardware, demo."""
+"""The command `elastic`, and what it does when something fails."""
 
 import contextlib
 import math
@@ -19,7 +19,7 @@ from rich.markup import escape
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
-from train.commands.playing import Compare, Demo, Evaluate, Identify, Play
+from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, View
 from train.runs.failures import DEFECT, explained
 
 Command = (
@@ -32,6 +32,7 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Play, tyro.conf.subcommand("play")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Hardware, tyro.conf.subcommand("hardware")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )

@@ -1,4 +1,4 @@
-"""Commands that play policies: identify, evaluate, compare, play, demo."""
+"""Commands that play policies: identify, evaluate, compare, play, view, demo."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -227,17 +227,44 @@ class Play:
 
     def run(self) -> None:
         """Play."""
-        from train.evaluate.conditions import Condition, PolicySpec
-        from train.evaluate.environments import environment
         from train.experiments.play import play
 
-        watched = environment(self.env).watched_reference if self.reference is None else None
-        with options_named():
-            condition = Condition(
-                env=self.env, policy=PolicySpec(name=self.policy), scenario=self.scenario, seed=self.seed,
-                reference=motion(self.env, self.reference) if watched is None else watched,
-            )  # fmt: skip
-        play(condition, CONSOLE, self.video, self.max_s)
+        play(_watched(self), CONSOLE, self.video, self.max_s)
+
+
+@dataclass
+class View:
+    """Look at one episode in the browser: reference, motor side and link side of the robot, side by side.
+
+    The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C. Sliders set the time,
+    and the factor by which deviations from the reference are enlarged. The page is served to whoever reaches the port,
+    without a password.
+
+    Example, one joint: elastic view --policy input --reference sine
+
+    Example, a walk: elastic view --env walker --policy input_output --scenario soft
+    """
+
+    policy: str = "uncompensated"
+    """Baseline, residual:PATH, or "FILE.py:function" for one's own; see elastic evaluate --help."""
+    env: str = "testbed"
+    """Environment: testbed, walker, or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
+    scenario: str = DEFAULT_SCENARIO
+    """Scenario."""
+    reference: str | None = None
+    """Motion, as in elastic evaluate; default sine, on the walker 3."""
+    seed: int = 0
+    """Seed of the episode."""
+    port: int = 0
+    """Port of the page; 0 takes the first free one from 8080 on."""
+    max_s: float | None = None
+    """Show the first so many seconds only [s]."""
+
+    def run(self) -> None:
+        """Play and show."""
+        from train.experiments.view import view
+
+        view(_watched(self), CONSOLE, self.port, self.max_s)
 
 
 @dataclass
@@ -252,6 +279,19 @@ class Demo:
         from train.experiments.demo import demo
 
         demo(CONSOLE, self.output)
+
+
+def _watched(command: Play | View) -> Any:
+    """The condition of an episode that somebody watches."""
+    from train.evaluate.conditions import Condition, PolicySpec
+    from train.evaluate.environments import environment
+
+    watched = environment(command.env).watched_reference if command.reference is None else None
+    with options_named():
+        return Condition(
+            env=command.env, policy=PolicySpec(name=command.policy), scenario=command.scenario, seed=command.seed,
+            reference=motion(command.env, command.reference) if watched is None else watched,
+        )  # fmt: skip
 
 
 def _print_files(comparison: Any) -> None:

@@ -2,7 +2,7 @@
 
 import io
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -44,11 +44,11 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
             _rehearse(policy, condition, console)
-        episode = _episode(env, policy, condition, steps, console)
+        steps_of_it = (step for step, _ in episode(env, policy, condition, steps, console))
         if video is None:
-            _window(episode, period)
+            _window(steps_of_it, period)
         else:
-            _film(env, episode, steps, period, video, console)
+            _film(env, steps_of_it, steps, period, video, console)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
@@ -58,8 +58,18 @@ def _rehearse(policy: Any, condition: Condition, console: Console) -> None:
         policy.rehearse(unseen, condition.seed)
 
 
-def _episode(env: Any, policy: Any, condition: Condition, steps: int, console: Console) -> Iterator[int]:
-    """Play step by step; yields the number of each step, and says so where the episode fails."""
+def episode(
+    env: Any, policy: Any, condition: Condition, steps: int, console: Console
+) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """Play step by step; yields number and info of each step, and says so where the episode fails.
+
+    Args:
+        env: One world.
+        policy: What commands it.
+        condition: What is played, for its seed and for errors.
+        steps: Number of steps at most.
+        console: Where messages go.
+    """
     observation, _ = env.reset(seed=condition.seed)
     state, start = None, np.array(True)
     for step in range(steps):
@@ -67,7 +77,7 @@ def _episode(env: Any, policy: Any, condition: Condition, steps: int, console: C
             action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
             observation, _, terminated, truncated, info = env.step(action)
         start = np.array(False)
-        yield step
+        yield step, info
         if terminated:
             console.print(f"the episode ended after {info['time_s']:.2f} s: {info['termination']}")
             return

@@ -46,6 +46,20 @@ def display_spec(robot: Thormang) -> mujoco.MjSpec:
     return spec
 
 
+def solid_spec(robot: Thormang) -> mujoco.MjSpec:
+    """The robot alone, without floor and light."""
+    spec = _dressed(robot, is_plan=False)
+    spec.delete(spec.body("floor"))
+    return spec
+
+
+def set_floor_and_light(spec: mujoco.MjSpec) -> None:
+    """Add to a scene what lies under the robot and above it."""
+    spec.worldbody.add_body(name="floor").add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05])
+    _add_floor(spec)
+    _add_light(spec)
+
+
 class _Shapes:
     """Adds shapes to the links of a robot: solid ones, or smaller and translucent ones of the plan."""
 

@@ -7,6 +7,7 @@ The factor becomes smaller, down to one, where the legs could not reach the feet
 translucent robot is the plan.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -19,6 +20,7 @@ from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rendering.picture import ModelPicture
+from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.robots.thormang.humanoid import (
     GRID_M,
     LEFT_RGBA,
@@ -29,6 +31,8 @@ from elastic_env.robots.thormang.humanoid import (
     ZMP_REFERENCE_RGBA,
     ZMP_RGBA,
     display_spec,
+    set_floor_and_light,
+    solid_spec,
 )
 from elastic_env.robots.thormang.model import LEG_JOINTS
 from elastic_env.robots.thormang.rows import WalkTruth
@@ -39,6 +43,7 @@ LARGEST_FACTOR = 3.0
 """Factor by which deviations of the pelvis are enlarged, as far as the legs reach."""
 
 _NUM_FACTORS = 81
+_ROBOT_DISTANCE_M = (0.0, 0.8, 0.0)
 _ALMOST = 1.0 - 1e-9
 _BELOW_THE_FLOOR = (0.0, 0.0, -1.0)
 _LEGEND = (
@@ -126,9 +131,25 @@ class WalkerPicture(ModelPicture):
         self._task = task
         self._factor = LARGEST_FACTOR
 
+    def alone(self) -> Alone:
+        """See `HasSides`."""
+        return Alone(solid_spec(self._task.config.robot), LEG_JOINTS, _ROBOT_DISTANCE_M, "pelvis", set_floor_and_light)
+
+    def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:
+        """See `HasSides`."""
+        truth, row = self._task.truth(), self._row(now)
+        planned = Posture.planned(self._task.plan, row)
+        q_ref = planned.joint_angles(truth.model.biped)
+        return Sides(
+            q_ref, truth.theta[world].copy(), truth.q[world].copy(), _pose(planned.pelvis, planned.R),
+            _pose(truth.pelvis[world], truth.pelvis_R[world]),
+        )  # fmt: skip
+
+    def _row(self, now: Mapping[str, float]) -> int:
+        return min(round(now["time_s"] / self._task.config.control_period_s), self._task.plan.num_steps)
+
     def _pose(self, now: dict[str, float], world: int) -> None:
-        plan = self._task.plan
-        row = min(round(now["time_s"] / self._task.config.control_period_s), plan.num_steps)
+        plan, row = self._task.plan, self._row(now)
         truth = self._task.truth()
         true, planned, robot = Posture.true(truth, world), Posture.planned(plan, row), truth.model.biped
         drawn, self._factor = enlarged(true, planned, plan.share[row], robot)
@@ -149,9 +170,7 @@ class WalkerPicture(ModelPicture):
 
     def _place(self, prefix: str, posture: Posture, robot: Biped) -> None:
         """Bring one of the two robots into a posture."""
-        quaternion = np.empty(4)
-        mujoco.mju_mat2Quat(quaternion, posture.R.ravel())
-        self._data.joint(f"{prefix}pelvis").qpos = [*posture.pelvis, *quaternion]
+        self._data.joint(f"{prefix}pelvis").qpos = _pose(posture.pelvis, posture.R)
         for joint, angle in zip(LEG_JOINTS, posture.joint_angles(robot), strict=True):
             self._data.joint(prefix + joint).qpos = angle
 
@@ -159,6 +178,13 @@ class WalkerPicture(ModelPicture):
         """Lay a marker on the floor, or hide it where there is no such point."""
         place = _BELOW_THE_FLOOR if np.isnan(x) else (x, y, 0.0)
         self._data.mocap_pos[self._model.body(marker).mocapid[0]] = place
+
+
+def _pose(position: Array, R: Array) -> Array:
+    """Position and quaternion, (7,)."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, R.ravel())
+    return np.concatenate([position, quaternion])
 
 
 def _phase(now: dict[str, float]) -> str:
