@@ -502,6 +502,25 @@ def test_report_needs_nothing_from_outside_and_shows_every_part() -> None:
     assert all(f"## {title}" in text for title in ("In short", *wanted[2:5], "Notes"))
 
 
+def test_report_begins_with_three_sentences() -> None:
+    """Catches a headline without figures, also where there are too few training seeds to judge."""
+    cells = [
+        cell(policy, {"all": values}, scenario)
+        for scenario in ("soft", "ideal")
+        for policy, values in (("base", [2.0, 4.0]), ("better", [1.0, None]))
+    ]
+    assert re.findall(r"<p>(.*?)</p>", report_of(cells))[0] == (
+        "2 policies played 8 episodes in 2 scenarios. The lowest pelvis error rms is that of better, "
+        "a mean of 1000.00 mrad, against 3000.00 mrad of base. 2 of 8 episodes count as falls."
+    )
+    few = [
+        e
+        for s in ("soft", "ideal")
+        for e in (cell("base", {"all": [2.0, 2.0]}, s), *family([[1.0, 1.0], [1.0, 1.0]], s))
+    ]
+    assert "by −50 %; 2 training seeds cannot tell that from chance, 5 are needed." in report_of(few)
+
+
 def test_report_of_a_sweep_draws_curves_and_falls() -> None:
     """Catches a sweep shown as one bar per value, and policies that fail unseen."""
     evaluations = [

@@ -104,6 +104,52 @@ class Results:
         return list(dict.fromkeys(name for e in self.evaluations for name in e.condition.swept))
 
 
+def summary(results: Results) -> str:
+    """Three sentences: what was played, who is best, and what learning adds or how many episodes failed."""
+    played = sum(len(e.episodes) for e in results.evaluations)
+    failed, lines = sum(e.num_failed for e in results.evaluations), results.lines
+    first = (
+        f"{_counted(len(lines.titles), 'policy', 'policies')} played {_counted(played, 'episode')} in "
+        f"{_counted(len(lines.scenarios), 'scenario')}."
+    )
+    failure = results.lines.environment.failures
+    third = f"{failed} of {played} episodes count as {failure}." if failed else "No episode failed."
+    return " ".join([first, _best_of_all(results), _learned(results) or third])
+
+
+def _best_of_all(results: Results) -> str:
+    """Who has the lowest mean of the first judged metric, and what the worst one has, of those that it is known of."""
+    column = results.lines.environment.judged[0]
+    cells: dict[str, list[float]] = {title: [] for title in results.lines.titles}
+    for evaluation in results.evaluations:
+        if len(found := evaluation.values(column.metric)):
+            cells[evaluation.condition.policy.title].append(float(found.mean()))
+    means = {title: float(np.mean(found)) for title, found in cells.items() if found}
+    if not means:
+        return f"No policy has a {column.title}."
+    best, worst = min(means, key=lambda title: means[title]), max(means, key=lambda title: means[title])
+    shown = {title: f"{column.scale * means[title]:.{column.decimals}f} {column.unit}" for title in (best, worst)}
+    against = f", against {shown[worst]} of {worst}" if best != worst else ""
+    return f"The lowest {column.title} is that of {best}, a mean of {shown[best]}{against}."
+
+
+def _learned(results: Results) -> str:
+    """What learning adds to its base in the first judged metric, or that there are too few training seeds to judge."""
+    rows = [row for row in results.changes if row.is_family and row.is_judged and not row.is_rival]
+    if not rows:
+        return ""
+    row = next((row for row in rows if row.is_group), rows[0])
+    found = f"{row.policy} changes the {row.column.title} of {row.base} in {row.scope} by"
+    if row.num_seeds < FEWEST_SEEDS:
+        few = f"{_counted(row.num_seeds, 'training seed')} cannot tell that from chance, {FEWEST_SEEDS} are needed"
+        return f"{found} {percent(row.relative.value)}; {few}."
+    return f"{found} {percent_interval(row.relative)}."
+
+
+def _counted(number: int, one: str, several: str = "") -> str:
+    return f"{number} {one if number == 1 else several or f'{one}s'}"
+
+
 def what(results: Results) -> list[tuple[str, str]]:
     """What was compared, when and with what: terms and texts."""
     lines, origin = results.lines, results.metadata

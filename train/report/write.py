@@ -14,7 +14,7 @@ from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenari
 from train.report.markdown import markdown
 from train.report.page import Page
 from train.report.robots_tables import ROBOTS, WORDS, robots_table
-from train.report.words import SCORES, Results, capital, in_short, notes, scores, what
+from train.report.words import SCORES, Results, capital, in_short, notes, scores, summary, what
 
 _LONG = 40
 """Rows from which on a table is folded away."""
@@ -44,7 +44,7 @@ def write_report(results: Results) -> list[Path]:
 def _page(results: Results) -> Page:
     known = results.lines.environment
     page = Page(f"Comparison: {results.name}", f"{capital(known.subject)}; made {results.metadata['created'][:10]}")
-    page.section("What was compared")
+    page.section("What was compared", summary(results))
     page.add("definitions", what(results))
     page.add("bullets", in_short(results))
     _add_leaderboard(page, results)
