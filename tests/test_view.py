@@ -82,7 +82,7 @@ def test_a_pose_is_enlarged_about_the_planned_one() -> None:
         np.array([*position, *rotation.as_quat(scalar_first=True)])
         for position, rotation in (((0, 0, 1), planned), ((0.1, 0, 1.2), true))
     ]
-    found = enlarged_pose(*poses, 3.0)
+    found = enlarged_pose(poses[0], poses[1], 3.0)
     np.testing.assert_allclose(found[:3], [0.3, 0.0, 1.6])
     expected = planned * Rotation.from_rotvec(3.0 * turn)
     np.testing.assert_allclose(Rotation.from_quat(found[3:], scalar_first=True).as_matrix(), expected.as_matrix())

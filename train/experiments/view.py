@@ -120,8 +120,8 @@ class _Sliders(plugin.ViewerPlugin):
     @messages.handler
     def _on_build_gui(self, _: messages.BuildGuiEvent) -> None:
         play = self._playback
-        imgui.SetNextWindowPos(imgui.Vec2(*_PLACE), imgui.Cond.FirstUseEver)
-        imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.FirstUseEver)
+        imgui.SetNextWindowPos(imgui.Vec2(*_PLACE), imgui.Cond.Once)
+        imgui.SetNextWindowSize(imgui.Vec2(*_SIZE), imgui.Cond.Once)
         if imgui.Begin(_TITLE):
             _, play.factor = imgui.SliderFloat("deviations drawn x", play.factor, 0.0, LARGEST_FACTOR)
             _, play.time_s = imgui.SliderFloat("time [s]", play.time_s, 0.0, play.recording.times_s[-1])
