@@ -503,15 +503,15 @@ def test_report_needs_nothing_from_outside_and_shows_every_part() -> None:
 
 
 def test_report_begins_with_three_sentences() -> None:
-    """Catches a headline without figures, also where there are too few training seeds to judge."""
+    """Catches a headline without figures, one that praises who falls, and a verdict of too few training seeds."""
     cells = [
         cell(policy, {"all": values}, scenario)
         for scenario in ("soft", "ideal")
         for policy, values in (("base", [2.0, 4.0]), ("better", [1.0, None]))
     ]
     assert re.findall(r"<p>(.*?)</p>", report_of(cells))[0] == (
-        "2 policies played 8 episodes in 2 scenarios. The lowest pelvis error rms is that of better, "
-        "a mean of 1000.00 mrad, against 3000.00 mrad of base. 2 of 8 episodes count as falls."
+        "2 policies played 8 episodes in 2 scenarios, of which 2 count as falls. "
+        "The lowest pelvis error rms is that of base, a mean of 3000.00 mrad. better comes last, with 1000.00 mrad."
     )
     few = [
         e

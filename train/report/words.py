@@ -23,12 +23,13 @@ from train.evaluate.changes import (
     percent_interval,
 )
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.evaluate import Evaluation, grouped
 from train.evaluate.families import Origin
 from train.evaluate.leaderboard import Standing
-from train.evaluate.maps import HeatMap
+from train.evaluate.maps import HeatMap, best_of, failed_of
 from train.evaluate.progress import Curves, learning_curves
 from train.evaluate.robots import RobotScores
+from train.evaluate.statistics import Estimate
 from train.report.parts import Lines, number_interval
 
 SCORES = (
@@ -105,32 +106,37 @@ class Results:
 
 
 def summary(results: Results) -> str:
-    """Three sentences: what was played, who is best, and what learning adds or how many episodes failed."""
-    played = sum(len(e.episodes) for e in results.evaluations)
-    failed, lines = sum(e.num_failed for e in results.evaluations), results.lines
+    """Three sentences: what was played and what failed, who is best, and what learning adds, or who comes last."""
+    played, lines = sum(len(e.episodes) for e in results.evaluations), results.lines
+    failed = sum(e.num_failed for e in results.evaluations)
+    of_these = f"of which {failed} count as {lines.environment.failures}" if failed else "none of which failed"
     first = (
         f"{_counted(len(lines.titles), 'policy', 'policies')} played {_counted(played, 'episode')} in "
-        f"{_counted(len(lines.scenarios), 'scenario')}."
+        f"{_counted(len(lines.scenarios), 'scenario')}, {of_these}."
     )
-    failure = results.lines.environment.failures
-    third = f"{failed} of {played} episodes count as {failure}." if failed else "No episode failed."
-    return " ".join([first, _best_of_all(results), _learned(results) or third])
+    best, worst = _ends(results)
+    return " ".join([first, best, _learned(results) or worst])
 
 
-def _best_of_all(results: Results) -> str:
-    """Who has the lowest mean of the first judged metric, and what the worst one has, of those that it is known of."""
+def _ends(results: Results) -> tuple[str, str]:
+    """Sentences on the best and the worst policy by the first judged metric; one that fails less often is better."""
     column = results.lines.environment.judged[0]
-    cells: dict[str, list[float]] = {title: [] for title in results.lines.titles}
-    for evaluation in results.evaluations:
-        if len(found := evaluation.values(column.metric)):
-            cells[evaluation.condition.policy.title].append(float(found.mean()))
-    means = {title: float(np.mean(found)) for title, found in cells.items() if found}
-    if not means:
-        return f"No policy has a {column.title}."
-    best, worst = min(means, key=lambda title: means[title]), max(means, key=lambda title: means[title])
-    shown = {title: f"{column.scale * means[title]:.{column.decimals}f} {column.unit}" for title in (best, worst)}
-    against = f", against {shown[worst]} of {worst}" if best != worst else ""
-    return f"The lowest {column.title} is that of {best}, a mean of {shown[best]}{against}."
+    played = grouped(results.evaluations, lambda e: e.condition.policy.title)
+    scores = {title: (_mean_of_cells(own, column), failed_of(own)) for title, own in played.items()}
+    best = best_of(scores)
+    if best is None:
+        return f"No policy has a {column.title}.", "No episode reached its end."
+    others = [title for title in scores if title != best and np.isfinite(scores[title][0].value)]
+    worst = max(others or [best], key=lambda title: (scores[title][1][0] / scores[title][1][1], scores[title][0].value))
+    shown = {t: f"{column.scale * scores[t][0].value:.{column.decimals}f} {column.unit}" for t in (best, worst)}
+    found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}."
+    return found, f"{worst} comes last, with {shown[worst]}." if others else "No other policy was played."
+
+
+def _mean_of_cells(evaluations: Sequence[Evaluation], column: Column) -> Estimate:
+    """Mean over the cells of a policy that have an episode which reached its end; nan where there is none [SI]."""
+    means = [float(values.mean()) for e in evaluations if len(values := e.values(column.metric))]
+    return Estimate(float(np.mean(means)) if means else float("nan"))
 
 
 def _learned(results: Results) -> str:
