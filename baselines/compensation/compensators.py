@@ -69,6 +69,8 @@ def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
     Raises:
         ElasticError: The matrix is singular.
     """
+    if isinstance(gravity, LegTorque):
+        return theta - gravity.solved(theta, stiffness)
     return theta - _solve(gravity, theta, stiffness, gravity.gravity_torque(theta))
 
 

@@ -60,13 +60,13 @@ class LegTorque:
         """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
         return self._chains.gradient(self._loads, _by_leg(q))
 
-    def solved(self, q: Array, stiffness: Array, torque: Array) -> Array:
+    def solved(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
         """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
 
         Args:
             q: (num_worlds, 12) [rad].
             stiffness: K, (12,) [N·m/rad].
-            torque: τ, (num_worlds, 12) [N·m].
+            torque: τ, (num_worlds, 12) [N·m]; None for τ_g.
 
         Returns:
             (num_worlds, 12) [rad].
@@ -75,10 +75,15 @@ class LegTorque:
             ElasticError: The matrix is singular.
         """
         legs, K, x = _by_leg(q), stiffness.reshape(_LEGS, _PER_LEG), np.empty(q.shape)
-        if not solutions(self._chains.legs, self._loads, legs, K, _by_leg(torque), _by_leg(x)):
+        given = _OWN if torque is None else _by_leg(torque)
+        if not solutions(self._chains.legs, self._loads, legs, K, given, _by_leg(x)):
+            torque = self.gravity_torque(q) if torque is None else torque
             # says so if it is singular
             solve_stiffness(np.broadcast_to(K, legs.shape), self.gradient_by_leg(q), _by_leg(torque))
         return x
+
+
+_OWN: Array = np.empty((0, _LEGS, _PER_LEG))
 
 
 def _by_leg(values: Array) -> Array:

@@ -8,7 +8,7 @@ Columns per joint are in the order of the robot's joints. Axes: x forward, y to 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -96,11 +96,13 @@ class PolicyInputs:
     @cached_property
     def is_empty(self) -> bool:
         """Whether no input is used."""
-        return all(getattr(self, field.name) is None for field in fields(self))
+        return all(value is None for value in vars(self).values())
 
     def with_deflection(self, correction: Array | None) -> "PolicyInputs":
         """The same with another relative change of the deflection."""
-        return self if correction is self.deflection else replace(self, deflection=correction)
+        if correction is self.deflection:
+            return self
+        return PolicyInputs(deflection=correction) if self.is_empty else replace(self, deflection=correction)
 
     @property
     def zmp_shift(self) -> Array | None:

@@ -20,6 +20,7 @@ re-taken at every support change. The center of mass in it follows from joint an
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -202,9 +203,9 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> t
 
 def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     """Inputs as rows of `INPUTS`, (num_worlds,)."""
-    dense = np.zeros(num_worlds, kernels.INPUTS)
     if inputs.is_empty:
-        return dense
+        return _none(num_worlds)
+    dense = np.zeros(num_worlds, kernels.INPUTS)
     if inputs.leg_length is not None:
         dense["leg_length"] = inputs.leg_length[:, 0]
     if inputs.balance_gain is not None:
@@ -214,6 +215,12 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     if inputs.deflection is not None:
         dense["deflection"] = inputs.deflection.reshape(-1, 2, 6)
     return dense
+
+
+@lru_cache
+def _none(num_worlds: int) -> Records:
+    """No inputs, which kernels do not change."""
+    return np.zeros(num_worlds, kernels.INPUTS)
 
 
 def _share(period_s: float, time_constant_s: float) -> float:

@@ -196,8 +196,8 @@ def as_rows(values: Array, own: int) -> Array:
     """(..., a, b) with `own` axes of their own as (rows, a, b) in one piece, so that one kernel fits all."""
     shape = values.shape
     batch = shape[: len(shape) - own]
-    if len(batch) == 1 and values.flags.c_contiguous and values.dtype == np.float64:
-        return values
+    if len(batch) == 1:
+        return np.ascontiguousarray(values, dtype=np.float64)
     return np.ascontiguousarray(values, dtype=np.float64).reshape(int(np.prod(batch)), *shape[len(batch) :])
 
 

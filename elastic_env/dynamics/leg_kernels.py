@@ -142,7 +142,7 @@ def solutions(legs: Any, loads: Any, q: Array, stiffness: Array, torque: Array, 
         loads: Rows of `loads_type`, (rows,).
         q: Joint angles, (rows, L, J) [rad].
         stiffness: K, (L, J) [N·m/rad].
-        torque: τ, (rows, L, J) [N·m].
+        torque: τ, (rows, L, J) [N·m]; none for the torque that holds the legs, (0, L, J).
         x: To be filled, (rows, L, J) [rad].
 
     Returns:
@@ -158,7 +158,11 @@ def solutions(legs: Any, loads: Any, q: Array, stiffness: Array, torque: Array, 
                 for k in range(len(b)):
                     A[i, k] /= stiffness[leg, i]
                 A[i, i] += 1.0
-                b[i] = torque[row, leg, i] / stiffness[leg, i]
+                if len(torque) > 0:
+                    b[i] = torque[row, leg, i] / stiffness[leg, i]
+                else:
+                    held = held_by(chain.axis[i], leg_of_row.carried[i], leg_of_row.gravity[i])
+                    b[i] = held / stiffness[leg, i]
             solve(A, b)
             for i in range(len(b)):
                 x[row, leg, i] = b[i]
