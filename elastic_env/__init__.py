@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["IDS", "ElasticJoint", "JointRobot", "Servo", "make_elastic"]
 
-_ENVIRONMENTS = "elastic_env.robots.testbed", "elastic_env.robots.thormang", "elastic_env.hardware.testbed"
+_ENVIRONMENTS = (
+    "elastic_env.robots.testbed", "elastic_env.robots.thormang", "elastic_env.robots.robot",
+    "elastic_env.hardware.testbed",
+)  # fmt: skip
 """Packages that say NAME and ID of an environment, and make it in a module `environment`."""
 
 _HOMES = {

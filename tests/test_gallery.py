@@ -21,7 +21,7 @@ from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.make_elastic import make_elastic, transformed
-from elastic_env.joint.model_file import urdf_spec
+from elastic_env.joint.model_file import keep_shapes, urdf_spec
 from elastic_env.joint.time_step import largest_stable_timestep
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.robots import gallery
@@ -260,12 +260,14 @@ def test_meshes_are_drawn_where_mujoco_reads_them(tmp_path: Path, visual: str | 
     """Catches shapes that add mass or touch something, and a picture without the link whose visual is of COLLADA."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype="<f4")
     faces = [corners[[0, 2, 1]], corners[[0, 1, 3]], corners[[0, 3, 2]], corners[[1, 2, 3]]]
-    (tmp_path / "meshes").mkdir()
+    (tmp_path / "robots" / "meshes").mkdir(parents=True)
     content = b"".join(struct.pack("<3f", 0, 0, 0) + face.tobytes() + b"\0\0" for face in faces)
-    (tmp_path / "meshes" / "wedge.stl").write_bytes(b" " * 80 + struct.pack("<I", len(faces)) + content)
-    (tmp_path / "meshes" / "wedge.dae").write_text("<COLLADA/>")
+    (tmp_path / "robots" / "meshes" / "wedge.stl").write_bytes(b" " * 80 + struct.pack("<I", len(faces)) + content)
+    (tmp_path / "robots" / "meshes" / "wedge.dae").write_text("<COLLADA/>")
     root = ET.fromstring(LINK.format(visual=visual or "wedge.stl"))
-    model = urdf_spec(root, tmp_path if visual else None).compile()
+    lost = keep_shapes(root, tmp_path / "robots" / "urdf" if visual else None)
+    model = urdf_spec(root, "the link").compile()
+    assert lost == []
     assert [model.mesh(i).name for i in range(model.nmesh)] == ([drawn] if drawn else [])
     assert model.body("arm").mass[0] == 2.0
     np.testing.assert_allclose(model.body("arm").ipos, [0.1, 0.0, 0.0])

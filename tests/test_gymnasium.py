@@ -15,6 +15,7 @@ from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 
 SIMULATIONS = {
     "elastic_env/Testbed-v0": {"reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}},
+    "elastic_env/Robot-v0": {"reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}},
     "elastic_env/WalkInPlace-v0": {"step_period": [0.3, 0.4, 0.3], "num_steps": 1},
 }
 IDS = sorted(SIMULATIONS)

@@ -74,6 +74,21 @@ class EndEffector:
         return tuple(made)
 
 
+def outermost_body(model: mujoco.MjModel) -> str:
+    """The body with a name that has the most bodies between it and the base, the last one of several.
+
+    Raises:
+        ConfigurationError: No body has a name.
+    """
+    depth = np.zeros(model.nbody, dtype=np.int64)
+    for body in range(1, model.nbody):
+        depth[body] = depth[model.body_parentid[body]] + 1
+    named = [body for body in range(1, model.nbody) if model.body(body).name]
+    if not named:
+        raise ConfigurationError("no body of the model has a name; give one to the body that is the end effector")
+    return str(model.body(max(named, key=lambda body: (depth[body], body))).name)
+
+
 def _found(model: mujoco.MjModel, name: str) -> tuple[int, Array, Array]:
     """Body of a site or body, place and orientation in it."""
     sites = {model.site(i).name: i for i in range(model.nsite)}

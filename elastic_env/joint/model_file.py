@@ -1,4 +1,4 @@
-"""Rigid models from files that others wrote, MJCF and URDF, for calculations that need no shapes."""
+"""Rigid models from files that others wrote, MJCF and URDF."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -16,7 +16,7 @@ _CURES = {
     "bad format in attribute": "it must be a number",
 }
 """What to do about errors of MuJoCo, by a part of their text."""
-_SHAPES, _READABLE = ("visual", "collision"), (".stl", ".obj")
+_SHAPES, _READABLE, _PACKAGE = ("visual", "collision"), (".stl", ".obj"), "package://"
 
 
 def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujoco.MjModel:
@@ -33,50 +33,63 @@ def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujo
     if isinstance(model, mujoco.MjModel):
         return model
     if isinstance(model, mujoco.MjSpec):
-        return _compiled(model, "the specification")
+        return compiled_spec(model, "the specification")
     if not isinstance(model, str | Path):
         raise ConfigurationError(f"a model must be a file, an MjSpec or an MjModel, got {shown(model)}")
     path = Path(model)
+    root = xml_of(path)
+    if root.tag != "robot":
+        return compiled_spec(mjcf_spec(path), str(path))
+    keep_shapes(root, None)
+    return compiled_spec(urdf_spec(root, str(path)), str(path))
+
+
+def xml_of(path: Path) -> ET.Element:
+    """What a file of MJCF or URDF holds.
+
+    Raises:
+        ConfigurationError: There is no such file, it is too large, or it is no XML.
+    """
     if not path.is_file():
         raise ConfigurationError(f"no model at {path}; give a file of MJCF (.xml) or URDF (.urdf)")
     if path.stat().st_size > _LARGEST_BYTES:
         raise ConfigurationError(f"{path} must have at most {_LARGEST_BYTES} bytes, it has {path.stat().st_size}")
     try:
-        root = ET.parse(path).getroot()
+        return ET.parse(path).getroot()
     except (ET.ParseError, UnicodeDecodeError, OSError) as error:
         raise ConfigurationError(f"{path} is no XML: {error}; give a file of MJCF (.xml) or URDF (.urdf)") from None
-    try:
-        is_urdf = root.tag == "robot"
-        spec = urdf_spec(root) if is_urdf else mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot read {path}: {_with_cure(error)}") from None
-    return _compiled(spec, str(path))
 
 
-def urdf_spec(robot: ET.Element, meshes: Path | None = None) -> mujoco.MjSpec:
-    """A specification from the root of a URDF; links that are fixed to others keep their names.
-
-    Args:
-        robot: It is changed: of its shapes those are left that are drawn.
-        meshes: Folder under which meshes of the URDF are drawn, found by the end of their path; None for no shapes.
-            They have no mass and touch nothing. Of a link whose visual meshes MuJoCo cannot read its collision meshes
-            are drawn, or nothing.
+def mjcf_spec(path: Path) -> mujoco.MjSpec:
+    """The specification that a file of MJCF holds.
 
     Raises:
-        ValueError: MuJoCo cannot read it.
+        ConfigurationError: MuJoCo cannot read it.
     """
-    for link in robot.iter("link"):
-        drawn = [] if meshes is None else _drawn(link, meshes)
-        for shape in [part for part in link if part.tag in _SHAPES]:
-            link.remove(shape)
-        for shape in drawn:
-            shape.tag = "visual"
-            link.append(shape)
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigurationError(f"MuJoCo cannot read {path}: {_with_cure(error)}") from None
+
+
+def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
+    """The specification of a URDF. Links that are fixed to others keep their names; shapes weigh and touch nothing.
+
+    Args:
+        robot: Root of the URDF with shapes that MuJoCo reads, see `keep_shapes`; it is changed.
+        name: What errors call it.
+
+    Raises:
+        ConfigurationError: MuJoCo cannot read it.
+    """
     for own in robot.findall("mujoco"):
         robot.remove(own)
     options = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
     ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler", options)
-    spec = mujoco.MjSpec.from_string(ET.tostring(robot, encoding="unicode"))
+    try:
+        spec = mujoco.MjSpec.from_string(ET.tostring(robot, encoding="unicode"))
+    except ValueError as error:
+        raise ConfigurationError(f"MuJoCo cannot read {name}: {_with_cure(error)}") from None
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a mesh that is not closed has no volume
     for geom in spec.geoms:
@@ -84,31 +97,64 @@ def urdf_spec(robot: ET.Element, meshes: Path | None = None) -> mujoco.MjSpec:
     return spec
 
 
-def _drawn(link: ET.Element, meshes: Path) -> list[ET.Element]:
-    """Visual or collision shapes of a link, whichever MuJoCo reads all of, with the paths of their meshes."""
-    for tag in _SHAPES:
-        shapes = link.findall(tag)
-        found = [(mesh, _mesh_file(mesh.get("filename", ""), meshes)) for s in shapes for mesh in s.iter("mesh")]
-        if shapes and all(path is not None for _, path in found):
-            for mesh, path in found:
-                mesh.set("filename", str(path))
-            return shapes
-    return []
+def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
+    """Leave of the shapes of a URDF those that are drawn.
+
+    Of a link whose visual meshes MuJoCo cannot read its collision shapes are drawn, or nothing.
+
+    Args:
+        robot: Root of the URDF; it is changed.
+        folder: Folder of the URDF, in and above which packages of meshes are looked for; None for no shapes.
+
+    Returns:
+        Meshes of links that are not drawn.
+    """
+    lost: list[str] = []
+    for link in robot.iter("link"):
+        drawn, missing = ([], []) if folder is None else _drawn(link, folder)
+        lost += missing
+        for shape in [part for part in link if part.tag in _SHAPES]:
+            link.remove(shape)
+        for shape in drawn:
+            shape.tag = "visual"
+            link.append(shape)
+    return lost
 
 
-def _mesh_file(name: str, meshes: Path) -> Path | None:
-    """The file of a mesh, whose name in a URDF may begin with `package://`; None if MuJoCo cannot read it."""
-    parts = Path(name.removeprefix("package://")).parts
-    candidates = [meshes.joinpath(*parts[first:]) for first in range(len(parts))]
-    path = next((path for path in candidates if path.is_file()), None)
-    return path if path is not None and path.suffix.lower() in _READABLE else None
+def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
+    """A specification compiled; `name` is what errors call it.
 
-
-def _compiled(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
+    Raises:
+        ConfigurationError: MuJoCo cannot compile it.
+    """
     try:
         return spec.compile()
     except ValueError as error:
         raise ConfigurationError(f"MuJoCo cannot compile {name}: {_with_cure(error)}") from None
+
+
+def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
+    """Visual or collision shapes of a link, whichever MuJoCo reads all of; else the meshes that it does not read."""
+    missing: list[str] = []
+    for tag in _SHAPES:
+        shapes = link.findall(tag)
+        named = [(mesh, mesh.get("filename", "")) for shape in shapes for mesh in shape.iter("mesh")]
+        found = [(mesh, _mesh_file(name, folder)) for mesh, name in named]
+        if shapes and all(path is not None for _, path in found):
+            for mesh, path in found:
+                mesh.set("filename", str(path))
+            return shapes, []
+        missing = missing or [name for (_, name), (_, path) in zip(named, found, strict=True) if path is None]
+    return [], missing
+
+
+def _mesh_file(name: str, folder: Path) -> Path | None:
+    """A mesh that MuJoCo reads, in the folder of the URDF, or of a package in a folder above; None without one."""
+    if Path(name).suffix.lower() not in _READABLE:
+        return None
+    relative = name.removeprefix(_PACKAGE).removeprefix("file://")
+    bases = [folder, *folder.resolve().parents] if name.startswith(_PACKAGE) else [folder]
+    return next((base / relative for base in bases if (base / relative).is_file()), None)
 
 
 def _with_cure(error: ValueError) -> str:

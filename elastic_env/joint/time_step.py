@@ -88,13 +88,23 @@ def require_stable(model: mujoco.MjModel, control_period_s: float) -> None:
     Raises:
         ConfigurationError: With the largest stable physics step.
     """
+    stable = stable_timestep(model, control_period_s)
+    if stable < model.opt.timestep:
+        raise ConfigurationError(
+            f"the joints are too stiff, or their links or rotors too light, for timestep_s = {model.opt.timestep:g} s: "
+            f"the simulation would explode; the largest stable one is timestep_s = {stable:.12g} s"
+        )
+
+
+def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
+    """The model's physics step; where the joints explode with it, the largest stable one that divides a period [s].
+
+    Raises:
+        ConfigurationError: None is stable, down to a millionth of it.
+    """
     if is_stable(model):
-        return
-    parts = int(np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9))
-    raise ConfigurationError(
-        f"the joints are too stiff, or their links or rotors too light, for timestep_s = {model.opt.timestep:g} s: the "
-        f"simulation would explode; the largest stable one is timestep_s = {control_period_s / parts:.12g} s"
-    )
+        return float(model.opt.timestep)
+    return control_period_s / int(np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9))
 
 
 def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -1,24 +1,34 @@
-"""Bodies to look at for a robot without shapes: a rod from each joint to the next."""
+"""Bodies to look at for links without shapes: rods from joint to joint, and balls at the ends."""
 
 import mujoco
 import numpy as np
 
+from elastic_env.core.signals import Array
+
 _RADIUS = 0.02
 """Of a rod, over the size of the robot."""
 _RGBA = (0.75, 0.76, 0.78, 1.0)
+_CAPSULE, _SPHERE = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 def add_simple_bodies(spec: mujoco.MjSpec) -> None:
-    """Draw every link that has a link at some distance as a rod. Rods have no mass and touch nothing.
+    """Draw every link without a shape by rods to its next links, or by a ball about its center of mass.
+
+    Rods and balls have no mass and touch nothing.
 
     Args:
-        spec: It is changed. Links that have shapes get a rod too.
+        spec: It is changed. It has to compile.
     """
-    lengths = [float(np.linalg.norm(body.pos)) for body in spec.bodies]
-    radius = _RADIUS * sum(lengths)
-    for body, length in zip(spec.bodies, lengths, strict=True):
-        if length > radius:
-            body.parent.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0.0, 0.0, 0.0, *body.pos], size=[radius, 0.0, 0.0],
-                mass=0.0, contype=0, conaffinity=0, rgba=_RGBA,
-            )  # fmt: skip
+    model = spec.copy().compile()
+    radius = _RADIUS * float(np.linalg.norm(model.body_pos, axis=1).sum())
+    for body in [body for body in spec.bodies if not body.geoms]:
+        ends = [model.body_pos[c] for c in np.flatnonzero(model.body_parentid == body.id) if c != body.id]
+        rods = [end for end in ends if np.linalg.norm(end) > radius]
+        for end in rods:
+            _add(body, _CAPSULE, radius, fromto=np.concatenate([np.zeros(3), end]))
+        if not rods and model.body_mass[body.id] > 0.0:
+            _add(body, _SPHERE, radius, pos=model.body_ipos[body.id])
+
+
+def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, radius: float, **place: Array) -> None:
+    body.add_geom(type=kind, size=[radius, 0.0, 0.0], rgba=_RGBA, mass=0.0, contype=0, conaffinity=0, **place)  # pyright: ignore[reportArgumentType]

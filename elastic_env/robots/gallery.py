@@ -8,7 +8,6 @@ as fingers of grippers, are held where the model has them. Nobody publishes stif
 these joints in a form that we could check. They are therefore assumed, by the rule of `assumed_joints`.
 """
 
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -23,7 +22,7 @@ from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.model_file import urdf_spec
+from elastic_env.joint.model_file import keep_shapes, urdf_spec, xml_of
 
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""
@@ -147,7 +146,9 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
     """
     path = gallery_file(name, folder)
     if path.suffix == ".urdf":
-        spec = urdf_spec(ET.parse(path).getroot(), path.parents[2] if shapes else None)
+        root = xml_of(path)
+        keep_shapes(root, path.parent if shapes else None)
+        spec = urdf_spec(root, str(path))
     else:
         spec = mujoco.MjSpec.from_file(str(path))
         for geom in spec.geoms:

@@ -38,6 +38,8 @@ _ENLARGED = 8.0
 """Factor by which a picture enlarges deviations from the reference."""
 _REFERENCE, _REFERENCE_RGBA = "elastic_env_reference_", (0.35, 0.65, 0.45, 0.35)
 """Prefix and colour of the robot that is the reference."""
+_POINT = 1e-4
+"""Moment of inertia of a point mass over its mass: that of a ball of 16 mm [m²]."""
 _RIGID_NM_PER_RAD = 1e15
 """Stiffness of a joint without a spring beside servos that give way."""
 
@@ -61,6 +63,8 @@ class JointRobot:
         load: Body that carries what the scenario `payload` adds; None for that of the last joint.
         imu: Site of the accelerometer; None for a robot without one.
         end_effector: Site or body whose place and tilt are scored; None to score the joints alone.
+        load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; None to scale the mass of
+            `load`.
     """
 
     name: str
@@ -70,6 +74,7 @@ class JointRobot:
     load: str | None = None
     imu: str | None = None
     end_effector: str | None = None
+    load_kg: float | None = None
 
     @property
     def id(self) -> str:
@@ -129,16 +134,28 @@ class JointRobot:
         Raises:
             ConfigurationError: The reference needs more torque than the servos have, or a sensor has no place.
         """
-        true_joints = {name: config.as_built(joint) for name, joint in config.joints.items()}
-        known, built = self.rigid(), _loaded(self.rigid(), self._load_body(), config.scenario.pendulum_mass_scale)
-        period = config.control_period_s
-        true = RobotModel(true_joints, built.copy().compile(), period)
-        body = TreeTorque(true.rigid, list(true_joints))
-        home = np.zeros(len(true_joints)) if self.home is None else np.array(self.home, dtype=np.float64)
-        if home.shape != (len(true_joints),):
-            raise ConfigurationError(f"home must have one angle per joint, {len(true_joints)}, got {len(home)}")
+        true = RobotModel(self._true_joints(config), self._loaded(config).compile(), config.control_period_s)
+        body = TreeTorque(true.rigid, true.joint_names)
+        home = np.zeros(len(true.joints)) if self.home is None else np.array(self.home, dtype=np.float64)
+        if home.shape != (len(true.joints),):
+            raise ConfigurationError(f"home must have one angle per joint, {len(true.joints)}, got {len(home)}")
         _require_feasible(config, true, body, home)
-        spec = transformed(built, true_joints, config.form)
+        assumed = RobotModel(_known_joints(config), self.rigid().compile(), config.control_period_s)
+        tool = None if self.end_effector is None else EndEffector(true.rigid, true.joint_names, self.end_effector)
+        return JointPlant(
+            name=self.name, model=self.elastic(config).compile(), assumed=assumed, true=true,
+            static_torque=body.gravity_torque, home=home,
+            rest_angle=partial(_rest_angle, stiffness=true.rest_stiffness(config.form), true=true, body=body),
+            end_effector=tool,
+        )  # fmt: skip
+
+    def elastic(self, config: JointRobotConfig) -> mujoco.MjSpec:
+        """What moves: the model with the scenario's load and elastic joints, and with the sensors.
+
+        Raises:
+            ConfigurationError: A sensor has no place.
+        """
+        spec = transformed(self._loaded(config), self._true_joints(config), config.form)
         spec.option.timestep, spec.option.integrator = config.timestep_s, mujoco.mjtIntegrator.mjINT_RK4
         # a NaN must end the episode, not restart the world behind the task's back
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -146,13 +163,19 @@ class JointRobot:
             if self.imu is None:
                 raise ConfigurationError(f"{self.name} has no IMU: name its site, JointRobot(..., imu=SITE)")
             add_accelerometer(spec, self.imu)
-        tool = None if self.end_effector is None else EndEffector(true.rigid, list(true_joints), self.end_effector)
-        return JointPlant(
-            name=self.name, model=spec.compile(), assumed=RobotModel(config.joints, known.compile(), period), true=true,
-            static_torque=body.gravity_torque, home=home,
-            rest_angle=partial(_rest_angle, stiffness=true.rest_stiffness(config.form), true=true, body=body),
-            end_effector=tool,
-        )  # fmt: skip
+        return spec
+
+    def _true_joints(self, config: JointRobotConfig) -> dict[str, ElasticJoint]:
+        return {name: config.as_built(joint) for name, joint in config.joints.items()}
+
+    def _loaded(self, config: JointRobotConfig) -> mujoco.MjSpec:
+        """The model with its load scaled, or with the share of a mass at its end effector."""
+        spec, scale = self.rigid(), config.scenario.pendulum_mass_scale
+        if scale == 1.0:
+            return spec
+        if self.load_kg is not None:
+            return _carrying(spec, self.end_effector, (scale - 1.0) * self.load_kg)
+        return _scaled(spec, self._load_body(), scale)
 
     def _load_body(self) -> str:
         if self.load is not None:
@@ -214,12 +237,32 @@ class JointPicture(ModelPicture):
         ]
 
 
-def _loaded(spec: mujoco.MjSpec, body: str, scale: float) -> mujoco.MjSpec:
+def _known_joints(config: JointRobotConfig) -> dict[str, ElasticJoint]:
+    """Joints as a compensator knows them: where the scenario is without friction, it knows of none."""
+    if config.scenario.friction_scale > 0.0:
+        return config.joints
+    return {name: one.replace(coulomb_friction=0.0, viscous_friction=0.0) for name, one in config.joints.items()}
+
+
+def _scaled(spec: mujoco.MjSpec, body: str, scale: float) -> mujoco.MjSpec:
     """A model with the mass of a body scaled, where it is."""
-    if scale != 1.0:
-        made, carrier = spec.copy().compile().body(body), spec.body(body)
-        carrier.mass, carrier.inertia = float(made.mass[0]) * scale, made.inertia * scale
-        carrier.ipos, carrier.iquat, carrier.explicitinertial = made.ipos, made.iquat, True
+    made, carrier = spec.copy().compile().body(body), spec.body(body)
+    carrier.mass, carrier.inertia = float(made.mass[0]) * scale, made.inertia * scale
+    carrier.ipos, carrier.iquat, carrier.explicitinertial = made.ipos, made.iquat, True
+    return spec
+
+
+def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> mujoco.MjSpec:
+    """A model with one point mass more at its end effector."""
+    site = next((site for site in spec.sites if site.name == end_effector), None)
+    carrier = spec.body(end_effector) if site is None else site.parent
+    if carrier is None or not mass > 0.0:
+        raise ConfigurationError(
+            f"the load at the end effector {end_effector!r} must be > 0 kg, got {mass:g} kg; name an end effector, and "
+            "give load_kg and the scenario's pendulum_mass_scale - 1 the same sign"
+        )
+    place = np.zeros(3) if site is None else site.pos
+    carrier.add_body(pos=place, mass=mass, ipos=[0.0] * 3, inertia=[_POINT * mass] * 3, explicitinertial=True)
     return spec
 
 
@@ -228,10 +271,24 @@ def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: TreeTor
     plan = config.reference.plan(np.random.default_rng(0), config.control_period_s)
     rows = slice(None, None, max(plan.num_steps // 500, 1))
     q, q_dot, q_ddot = (np.tile(x[rows, None], (1, len(home))) for x in (plan.q, plan.q_dot, plan.q_ddot))
+    _require_in_range(config, robot, q + home)
     motion = body.inverse_dynamics(q + home, q_dot, q_ddot) + robot.rotor_inertia * q_ddot
     friction = robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
     limits = np.array([servo.torque_limit for servo in robot.servos])
     require_torque(config.reference, np.abs(motion).max(axis=0) + friction, limits)
+
+
+def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> None:
+    """Refuse a reference that presses a joint against its limit."""
+    for column, name in enumerate(robot.joint_names):
+        joint = robot.rigid.joint(name).id
+        lowest, highest = robot.rigid.jnt_range[joint]
+        least, most = float(q[:, column].min()), float(q[:, column].max())
+        if robot.rigid.jnt_limited[joint] and (least < lowest or most > highest):
+            raise ConfigurationError(
+                f"the reference {config.reference.kind!r} moves joint {name!r} from {least:.3f} to {most:.3f} rad, and "
+                f"its range is {lowest:.3f} to {highest:.3f} rad; lower the amplitude, or choose another home"
+            )
 
 
 def _rest_angle(command: Array, stiffness: Array, true: RobotModel, body: TreeTorque) -> Array:

@@ -11,6 +11,7 @@ from typing import Any
 from baselines.policies import is_saved
 from baselines.residual.residual import located
 from train.evaluate.conditions import Condition
+from train.evaluate.robot_file import files_of_robot
 from train.workers.versions import physics
 
 _NOT_OF_THE_RESULT = {"policy": {"level", "track"}, "member": {"rival"}}
@@ -20,8 +21,8 @@ _NOT_OF_THE_RESULT = {"policy": {"level", "track"}, "member": {"rival"}}
 def cell_key(condition: Condition) -> str:
     """SHA-256 digest of a condition, of the files that it names, and of the versions of the physics.
 
-    Files are weights of residuals, tables of offsets and stiffness, and Python files of the user's, with those of their
-    folder that they import. What such a file reads when it runs is not seen.
+    Files are weights of residuals, tables of offsets and stiffness, robots with their models and joints, and Python
+    files of the user's, with those of their folder that they import. What such a file reads when it runs is not seen.
     """
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
     files = {str(file): _digest(file) for text in _texts(content) for file in named_files(text)}
@@ -39,7 +40,7 @@ def named_files(text: str) -> list[Path]:
         return sorted(_with_imports(Path(place), set()))
     if name.isidentifier() and (source := _source(place)):
         return sorted(_with_imports(source, set()))
-    return [Path(text)] if _is_file(Path(text)) else []
+    return [Path(text), *files_of_robot(text)] if _is_file(Path(text)) else []
 
 
 def _is_file(path: Path) -> bool:

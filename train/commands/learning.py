@@ -108,7 +108,8 @@ class Iterate:
     """
 
     env: str = "walker"
-    """Environment: walker, testbed, or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
+    """Environment: walker, testbed, robot, ROBOT.yaml (a file of any robot, see docs/robots.md),
+    or "FILE.py:ROBOT", a JointRobot."""
     scenario: str = DEFAULT_SCENARIO
     """Scenario, see elastic evaluate --help."""
     reference: str | None = None

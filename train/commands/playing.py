@@ -96,7 +96,7 @@ class Evaluate:
     uncompensated_open, input_open, input_output, input_wrench."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in place),
-    or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
+    robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a JointRobot."""
     scenario: str | None = None
     """Scenario, such as nominal (default), ideal, soft, stiff, payload, backlash,
     sensor, ideal+soft; on the walker also spread, imu, push, slope, drawn, drawn_beyond."""
@@ -213,7 +213,8 @@ class Play:
     policy: str = "uncompensated"
     """Baseline, residual:PATH, or "FILE.py:function" for one's own; see elastic evaluate --help."""
     env: str = "testbed"
-    """Environment: testbed, walker, or "FILE.py:ROBOT", an elastic_env.JointRobot of one's own."""
+    """Environment: testbed, walker, robot, ROBOT.yaml (a file of any robot, see docs/robots.md),
+    or "FILE.py:ROBOT", a JointRobot."""
     scenario: str = DEFAULT_SCENARIO
     """Scenario."""
     reference: str | None = None

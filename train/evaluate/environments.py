@@ -11,6 +11,7 @@ from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
 from elastic_env.robots.joint_robot import JointRobot
 from elastic_env.runtime.scenario import make_scenario
+from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
 
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
@@ -172,16 +173,24 @@ def environment(name: str) -> Environment:
     """The environment of a short name, or that of a robot of one's own.
 
     Args:
-        name: Short name, or "FILE.py:ROBOT" or "module:ROBOT", a `JointRobot`, which is imported and registered.
+        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or "module:ROBOT", a
+            `JointRobot`, which is imported and registered.
 
     Raises:
         ConfigurationError: It does not exist.
     """
+    if name.endswith(ENDINGS):
+        return _of_file(name)
     if ":" in name:
         return _of_ones_own(name)
     if name not in ENVIRONMENTS:
-        raise unknown_name("environment", name, [*ENVIRONMENTS, "FILE.py:ROBOT"])
+        raise unknown_name("environment", name, [*ENVIRONMENTS, "ROBOT.yaml", "FILE.py:ROBOT"])
     return ENVIRONMENTS[name]
+
+
+def _of_file(name: str) -> Environment:
+    of_robot = read_robot_file(name)
+    return replace(ENVIRONMENTS["robot"], arguments=lambda reference: {**of_robot, "reference": reference})
 
 
 @lru_cache(maxsize=64)
@@ -362,6 +371,9 @@ _HARDWARE = replace(
     is_real=True,
 )
 
-_OWN = {"testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE}
+_OWN = {
+    "testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE,
+    "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"]),
+}  # fmt: skip
 ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known) for name, known in IDS.items()}
 """Environments by their short names: those with figures of their own, and other robots of elastic joints."""

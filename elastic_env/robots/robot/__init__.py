@@ -1,0 +1,3 @@
+"""Any robot on a fixed base, from a file of MJCF or URDF and the elasticity of its joints."""
+
+NAME, ID = "robot", "elastic_env/Robot-v0"

@@ -1,0 +1,133 @@
+"""`elastic_env/Robot-v0`: any robot on a fixed base, from a file of its rigid model and one of its elastic joints.
+
+env = gymnasium.make("elastic_env/Robot-v0", model="arm.xml", joints="arm.yaml", end_effector="tool")
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+
+from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.dynamics.end_effector import outermost_body
+from elastic_env.joint.frozen import frozen, require_fixed_base
+from elastic_env.joint.model_file import compiled_spec
+from elastic_env.joint.time_step import stable_timestep
+from elastic_env.motion.references import AnyReference
+from elastic_env.registration import Robot
+from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
+from elastic_env.robots.robot import ID, NAME
+from elastic_env.robots.robot.joints import GivenJoints, elastic_joints, home_of_joints, read_joints
+from elastic_env.robots.robot.model import GivenModel, RigidModel, read_robot
+from elastic_env.runtime.joint_config import RewardWeights
+from elastic_env.runtime.joint_task import JointTask
+from elastic_env.runtime.scenario import Scenario
+
+EXAMPLE = Path(__file__).with_name("example.xml")
+"""The made-up arm that is played where no model is named; its joints are in the YAML file beside it."""
+
+LOAD_SHARE = 0.2
+"""Share of the mass of the joints' links that servos of unknown limits can carry: what the scenario `payload` adds."""
+
+
+class RobotConfig(JointRobotConfig):
+    """All of the environment of any robot."""
+
+    robot: JointRobot
+    """The robot as its files describe it."""
+
+
+def configure_robot(
+    model: GivenModel | None = None,
+    joints: GivenJoints | None = None,
+    reference: str | dict[str, Any] | AnyReference = "multisine",
+    scenario: str | Scenario = "nominal",
+    end_effector: str | None = None,
+    home: Mapping[str, float] | Sequence[float] | None = None,
+    load_kg: float | None = None,
+    imu: str | None = None,
+    stiffness: float | str | Path | list[float] | None = None,
+    form: Literal["tendon", "rigid"] = "tendon",
+    sensors: Sequence[str] = (),
+    reward: RewardWeights | dict[str, float] | None = None,
+    timestep_s: float | None = None,
+) -> RobotConfig:
+    """The configuration from the arguments of `gymnasium.make("elastic_env/Robot-v0", ...)`.
+
+    Args:
+        model: File of MJCF (.xml) or URDF (.urdf), the text of one, or a `mujoco.MjSpec`; without it and joints a
+            made-up arm of four joints.
+        joints: YAML file or mapping of the elastic joints by name or pattern, see `elastic_env.robots.robot.joints`.
+            All other joints are held where the model's first keyframe has them, or at its reference.
+        reference: "sine", "multisine", "steps", "hold", a mapping with `kind` and parameters, or a reference model.
+        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+        end_effector: Site or body whose place and tilt are scored; default the outermost body.
+        home: Angle about which each joint follows the reference, by name or in order [rad]; default the model's first
+            keyframe, or its reference, within the joint ranges.
+        load_kg: The scenario `payload` adds a fifth of this mass at the end effector [kg]; default the mass that the
+            joints carry.
+        imu: Site of the accelerometer.
+        stiffness: K in place of that in `joints` [N·m/rad], one number or one per joint.
+        form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
+        sensors: What is observed beside the standard set, see `elastic_env.runtime.further_sensors`.
+        reward: Weights of the reward terms, or a mapping of what differs from the default.
+        timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms, or where the joints explode
+            with it the largest stable one [s].
+
+    Raises:
+        ConfigurationError: A file, a name, a parameter or a combination that does not exist, or a model that floats.
+    """
+    if model is None and joints is None:
+        model, joints, end_effector = EXAMPLE, EXAMPLE.with_suffix(".yaml"), end_effector or "tool"
+    if model is None:
+        raise ConfigurationError(f"{ID} needs a model beside joints, such as model='arm.xml'")
+    robot = joint_robot(model, {} if joints is None else joints, end_effector)
+    robot = replace(robot, home=_home(robot, home), imu=imu, **({} if load_kg is None else {"load_kg": load_kg}))
+    settings = robot.configure(reference, scenario, stiffness, form, sensors, reward, timestep_s)
+    if timestep_s is None:
+        model_played = compiled_spec(robot.elastic(settings), "the model with elastic joints")
+        settings = settings.replace(timestep_s=stable_timestep(model_played, settings.control_period_s))
+    return RobotConfig(robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields})
+
+
+def joint_robot(model: GivenModel, joints: GivenJoints, end_effector: str | None = None) -> JointRobot:
+    """A robot from the file of its rigid model and that of its joints; arguments and errors as `configure_robot`."""
+    spec = read_robot(model)
+    whole = compiled_spec(spec, "the model")
+    require_fixed_base(whole)
+    hinges = [whole.joint(j).name for j in range(whole.njnt) if whole.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    settings = read_joints(joints, hinges)
+    moving = frozen(spec, settings)
+    names, rigid = list(settings), moving.copy().compile()
+    mass = float(rigid.body_subtreemass[0])
+    elastic = elastic_joints(moving, settings, LOAD_SHARE * mass)
+    if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
+        raise ConfigurationError("encoder_counts_per_turn must be the same for all joints; give it under '*'")
+    return JointRobot(
+        NAME, RigidModel(model, tuple(names)), elastic, home=home_of_joints(whole, names).tolist(),
+        end_effector=end_effector or outermost_body(rigid), load_kg=mass,
+    )  # fmt: skip
+
+
+def _home(robot: JointRobot, given: Mapping[str, float] | Sequence[float] | None) -> Sequence[float] | None:
+    """Angles by name, of which those that are not given are the robot's own."""
+    if not isinstance(given, Mapping):
+        return robot.home if given is None else given
+    require_known("joint of home", given, robot.joints)
+    own: Sequence[float] = robot.home or [0.0] * len(robot.joints)
+    return [given.get(name, angle) for name, angle in zip(robot.joints, own, strict=True)]
+
+
+def _task(config: RobotConfig, num_worlds: int) -> JointTask:
+    return JointTask(config, config.robot.plant(config), num_worlds)
+
+
+def _picture(task: JointTask) -> JointPicture:
+    assert isinstance(task.config, RobotConfig)
+    return JointPicture(task.config.robot, task)
+
+
+ROBOT = Robot(NAME, ID, configure_robot, _task, _picture)  # pyright: ignore[reportArgumentType]
+make, make_vector = ROBOT.make, ROBOT.make_vector

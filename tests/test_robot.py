@@ -1,0 +1,240 @@
+"""`elastic_env/Robot-v0`: any robot from a model file and its joints."""
+
+import copy
+import pickle
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+import elastic_env  # noqa: F401  registers the environment
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.joint.frozen import frozen
+from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
+from tests.played import metrics_of
+from tests.trees import TREE
+from train.commands.cli import main
+
+JOINTS = {"*": {"stiffness": 800.0}, "wrist": 400.0}
+QUICK = {"kind": "sine", "amplitude": 0.2, "duration_s": 1.0, "onset_s": 0.5}
+ARM = EXAMPLE.read_text()
+
+
+def scalar(**arguments: Any) -> Any:
+    given = {"model": ARM, "joints": JOINTS, "end_effector": "tool", "reference": QUICK, "scenario": "ideal"}
+    return gymnasium.make("elastic_env/Robot-v0", **{**given, **arguments})
+
+
+def with_actuators(actuators: str, also: str = "") -> str:
+    return ARM.replace("<keyframe>", f"<actuator>{actuators}</actuator>{also}<keyframe>")
+
+
+def test_held_joints_are_where_the_keyframe_has_them() -> None:
+    """Catches hinges and slides that are taken out in another place: MuJoCo's own kinematics are the judge."""
+    ref = 'knee" axis="0 -1 0.1" pos="0.01 0.02 0" ref="-0.5"'
+    assert ref in TREE
+    whole = mujoco.MjSpec.from_string(
+        TREE.replace("</mujoco>", '<keyframe><key qpos="0.4 -0.3 0.9 0.5 -0.2 0.7"/></keyframe></mujoco>')
+    )
+    moving = ["pitch", "hip", "twist"]
+    model, part = whole.compile(), frozen(whole, moving).compile()
+    data, of_part = mujoco.MjData(model), mujoco.MjData(part)
+    generator = np.random.default_rng(1)
+    for _ in range(5):
+        data.qpos[:] = model.key_qpos[0]
+        for name, angle in zip(moving, generator.uniform(-1.0, 1.0, 3), strict=True):
+            data.joint(name).qpos = of_part.joint(name).qpos = angle
+        mujoco.mj_forward(model, data)
+        mujoco.mj_forward(part, of_part)
+        np.testing.assert_allclose(of_part.xipos, data.xipos, atol=1e-12)
+        np.testing.assert_allclose(of_part.ximat, data.ximat, atol=1e-12)
+        for name in moving:
+            np.testing.assert_allclose(of_part.joint(name).qfrc_bias, data.joint(name).qfrc_bias, atol=1e-11)
+
+
+def test_what_is_not_given_comes_from_the_model() -> None:
+    """Catches gains without their gear, a limit of the wrong actuator, and friction that is taken twice."""
+    model = with_actuators(
+        '<position joint="base" kp="300" kv="7" gear="2" forcerange="-30 40"/>'
+        '<motor joint="shoulder" gear="5" ctrlrange="-12 12"/>'
+    ).replace('name="wrist" axis', 'name="wrist" armature="0.03" frictionloss="0.4" damping="0.6" axis')
+    config = configure_robot(model, JOINTS)
+    wrist, (base, shoulder, *_) = config.joints["wrist"], config.robot.plant(config).true.servos
+    assert (base.position_gain, base.velocity_gain, base.integral_gain) == (1200.0, 28.0, 0.0)
+    assert base.torque_limit == 60.0
+    assert shoulder.torque_limit == 60.0
+    assert shoulder.integral_gain > 0.0
+    assert (wrist.rotor_inertia, wrist.coulomb_friction, wrist.viscous_friction) == (0.03, 0.4, 0.6)
+    assert [joint.stiffness for joint in config.joints.values()] == [800.0, 800.0, 800.0, 400.0]
+    played = config.robot.plant(config).model
+    assert played.joint("wrist").frictionloss[0] == pytest.approx(0.4)
+    assert played.joint("wrist").damping[0] == pytest.approx(0.6)
+    assert config.robot.home == [0.0, 0.6, 0.9, 0.4]
+
+
+def test_the_file_of_an_identification_is_taken(tmp_path: Path) -> None:
+    """Catches a format that the command writes and the environment does not read."""
+    file = tmp_path / "joints.yaml"
+    file.write_text(
+        "# stiffness [N·m/rad], by elastic identify\nbase: {stiffness: 900}  # ± 2 %\nelbow: {stiffness: 700}\n"
+    )
+    config = configure_robot(ARM, file)
+    assert {name: joint.stiffness for name, joint in config.joints.items()} == {"base": 900.0, "elbow": 700.0}
+
+
+CORD = '<tendon><fixed name="cord" stiffness="5"><joint joint="grip" coef="1"/></fixed></tendon>'
+NO_MASS = '<mujoco><worldbody><body><joint name="a"/><geom size="0.1" mass="0"/></body></worldbody></mujoco>'
+NO_HINGE = '<mujoco><worldbody><body><joint name="a" type="slide"/><geom size="0.1"/></body></worldbody></mujoco>'
+FLOATS = NO_HINGE.replace('name="a" type="slide"', 'name="a" type="free"').replace(
+    "</body>", '<body><joint name="b"/><geom size="0.1"/></body></body>'
+)
+NO_MESH = (
+    '<mujoco><asset><mesh name="m" file="lost.stl"/></asset><worldbody><body name="link"><joint name="a"/>'
+    '<geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"joints": None}, r"no joint its stiffness K.*elastic identify --robot"),
+        ({"joints": {}}, r"no joint its stiffness K"),
+        ({"joints": {"*": {"damping": 3.0}}}, r"'base' needs its stiffness K.*elastic identify --robot"),
+        ({"joints": {"*": 0.0}}, r"joint 'base':.*stiffness.*> 0"),
+        ({"joints": {"*": "stiff"}}, r"joint 'base':.*stiffness.*number"),
+        ({"joints": {"*": 800.0, "ellbow": 300.0}}, r"unknown joint or pattern .* 'ellbow'.*Did you mean 'elbow'"),
+        ({"joints": {"grip": 800.0}}, r"unknown joint or pattern of joints 'grip'; choose one of: base, shoulder"),
+        ({"joints": "none.yaml"}, r"no configuration file at none.yaml"),
+        ({"joints": {"*": {"stiffness": 1.0, "colour": 2}}}, r"joint 'base':.*colour"),
+        ({"model": None}, r"needs a model beside joints"),
+        ({"model": "none.xml"}, r"no model at none.xml; give a file of MJCF"),
+        ({"model": 3}, r"model must be a file of MJCF"),
+        ({"model": "<mujoco>"}, r"is no XML"),
+        ({"model": NO_HINGE}, r"the model has no hinge.*rotary joints"),
+        ({"model": FLOATS}, r"joint 'a' is free or a ball joint; a fixed base"),
+        ({"model": NO_MASS}, r"mass and inertia of moving bodies.*needs a mass .kg. and an inertia"),
+        ({"model": NO_MESH}, r"body 'link'.*has its mass from a mesh that cannot be read.*give the body an <inertial>"),
+        ({"end_effector": "tol"}, r"unknown site or body for end_effector 'tol'.*Did you mean 'tool'"),
+        ({"home": {"elbo": 1.0}}, r"unknown joint of home 'elbo'"),
+        ({"reference": {**QUICK, "amplitude": 2.5}}, r"moves joint 'shoulder' from.*to.*rad, and its range is"),
+        (
+            {"model": with_actuators('<position joint="base" kp="300" timeconst="0.1"/>')},
+            r"no single position servo.*position_gain.*under `servo`",
+        ),
+        (
+            {"model": with_actuators("", '<equality><joint joint1="elbow" joint2="wrist"/></equality>')},
+            r"equality constraint of elbow and wrist, whose torque is not known in advance; take it out",
+        ),
+        (
+            {"model": with_actuators("", CORD.replace("grip", "elbow"))},
+            r"tendon 'cord' has stiffness.*take it out",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_says_what_to_do(arguments: dict[str, Any], message: str) -> None:
+    """Catches tracebacks of MuJoCo, and models that are played as something else than they are."""
+    with pytest.raises(ConfigurationError, match=message):
+        scalar(**arguments)
+
+
+def test_what_holds_is_taken_out_without_a_word() -> None:
+    """Catches a gripper whose tendon, coupling and actuator keep a robot from being played."""
+    also = CORD + '<equality><joint joint1="grip"/></equality>'
+    config = configure_robot(with_actuators('<position joint="grip" kp="300"/><position tendon="cord"/>', also), JOINTS)
+    assert list(config.joints) == ["base", "shoulder", "elbow", "wrist"]
+
+
+def test_missing_meshes_are_drawn_as_capsules_and_said_once() -> None:
+    """Catches a model that cannot be played because of what it looks like, and a picture without a robot."""
+    inertial = '<inertial mass="1" pos="0 0 0.1" diaginertia="0.01 0.01 0.01"/>'
+    model = NO_MESH.replace("<geom", f'{inertial}<body pos="0 0 0.4">{inertial}</body><geom')
+    with pytest.warns(UserWarning, match=r"1 meshes .* missing or in a format .* lost.stl") as said:
+        env = scalar(model=model, joints={"*": 800.0}, end_effector="link", render_mode="rgb_array")
+    assert len([one for one in said if "meshes" in str(one.message)]) == 1
+    env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.ptp(env.render()[100:-60]) > 100  # the robot, not the background alone
+    env.close()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on(copied: Any) -> None:
+    """Catches specifications of MuJoCo, which do not travel."""
+    env = scalar(scenario="sensor")
+    env.reset(seed=1)
+    twin = copied(env)
+    action = np.full(4, 0.01, dtype=np.float32)
+    for _ in range(20):
+        np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
+
+
+def test_worlds_of_a_vector_are_the_scalar_ones() -> None:
+    """Catches a world that depends on its neighbours."""
+    arguments = {
+        "scenario": "sensor",
+        "reference": {"kind": "multisine", "amplitude": 0.2, "duration_s": 0.2, "onset_s": 0.2},
+    }
+    given = {"model": ARM, "joints": JOINTS, "vectorization_mode": "vector_entry_point", **arguments}
+    many = gymnasium.make_vec("elastic_env/Robot-v0", num_envs=2, **given)
+    seen = [many.reset(seed=5)[0]]
+    action = np.full((2, 4), 0.01, dtype=np.float32)
+    seen += [many.step(action)[0] for _ in range(280)]
+    for world in range(2):
+        env = scalar(**arguments)
+        alone = [env.reset(seed=5 + world)[0]] + [env.step(action[0])[0] for _ in range(280)]
+        np.testing.assert_array_equal(np.array(alone), np.array(seen)[:, world])
+
+
+def test_a_payload_hangs_at_the_end_effector() -> None:
+    """Catches a load that nobody carries: its torque is that of a point mass in MuJoCo's own model."""
+    config = configure_robot(ARM, JOINTS, scenario="ideal+payload", end_effector="tool", load_kg=5.0)
+    plant = config.robot.plant(config)
+    loaded = mujoco.MjSpec.from_string(
+        ARM.replace(
+            '<site name="tool" pos="0 0 0.15"/>',
+            '<body pos="0 0 0.15"><geom type="sphere" size="0.01" mass="1"/></body>',
+        )
+    )
+    model = loaded.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.key_qpos[0]
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(plant.static_torque(data.qpos[None, :4])[0], data.qfrc_bias[:4], rtol=1e-9, atol=1e-9)
+    assert plant.assumed.rigid.body_mass.sum() == pytest.approx(12.1)
+    assert plant.true.rigid.body_mass.sum() == pytest.approx(13.1)
+
+
+def test_compensators_take_the_motion_of_the_end_effector_back() -> None:
+    """Catches a compensator that knows another friction, servo or load than the robot has."""
+    without, compensated = (metrics_of(scalar(), policy) for policy in ("uncompensated", "dynamic"))
+    assert without["end_effector_error_rms_m"] > 2e-3
+    assert compensated["end_effector_error_rms_m"] < 0.05 * without["end_effector_error_rms_m"]
+
+
+def test_the_commands_play_a_robot_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a command that needs Python for a robot, and paths that hang on the working directory."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "arm.xml").write_text(ARM)
+    (folder / "arm.yaml").write_text(EXAMPLE.with_suffix(".yaml").read_text())
+    (folder / "arm.robot.yaml").write_text("model: arm.xml\njoints: arm.yaml\nend_effector: tool\n")
+    motion = "{kind: sine, amplitude: 0.2, duration_s: 0.5, onset_s: 0.5}"
+    main(["evaluate", "--env", "mine/arm.robot.yaml", "--policy", "dynamic", "--reference", motion])
+    assert "end_effector_error_rms_m" in (tmp_path / "runs" / "evaluate" / "episodes.csv").read_text()
+    (tmp_path / "both.yaml").write_text(
+        f"name: both\nenv: mine/arm.robot.yaml\nreferences: [{motion}]\nscenarios: [ideal]\n"
+        "policies: [uncompensated, input]\n"
+    )
+    main(["compare", "both.yaml"])
+    assert "end effector error" in (tmp_path / "runs" / "both" / "report.html").read_text()
+    (tmp_path / "no.yaml").write_text("name: no\n")
+    from train.evaluate.environments import environment
+
+    with pytest.raises(ConfigurationError, match=r"no.yaml must be a file of a robot, with the keys model and joints"):
+        environment("no.yaml")

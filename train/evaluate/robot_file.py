@@ -1,0 +1,69 @@
+"""A robot as a file of YAML: what `--env arm.robot.yaml` names, so that no Python has to be written.
+
+    model: arm.xml
+    joints: arm.yaml
+    end_effector: tool
+
+Files that it names are looked for beside it.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from elastic_env.core.config import Locator, Model, load_yaml, quantity
+from elastic_env.core.errors import ConfigurationError
+
+ENDINGS = (".yaml", ".yml")
+"""Of files of robots."""
+
+
+class RobotFile(Model):
+    """A robot on a fixed base; keys as of `gymnasium.make("elastic_env/Robot-v0", ...)`."""
+
+    model: Locator
+    """Rigid model, a file of MJCF (.xml) or URDF (.urdf)."""
+    joints: Locator | dict[str, Any]
+    """Elastic joints: a YAML file, or a mapping from names or patterns."""
+    end_effector: Locator | None = None
+    """Site or body whose place and tilt are scored; None for the outermost body."""
+    home: dict[str, float] | list[float] | None = None
+    """Angles about which the joints follow a reference, by name or in order [rad]."""
+    load_kg: float | None = quantity(
+        "kg", None, gt=0, description="the scenario `payload` adds a fifth of it at the end effector"
+    )
+    imu: Locator | None = None
+    """Site of the accelerometer."""
+
+    def arguments(self, folder: Path) -> dict[str, Any]:
+        """Arguments of the environment; files are those of a folder."""
+        given = {name: value for name, value in self.model_dump().items() if value is not None}
+        return {**given, **{name: str(folder / given[name]) for name in ("model", "joints") if _is_path(given[name])}}
+
+
+def read_robot_file(name: str) -> dict[str, Any]:
+    """Arguments of `elastic_env/Robot-v0` from a file.
+
+    Raises:
+        ConfigurationError: The file is missing or does not describe a robot.
+    """
+    try:
+        return load_yaml(name, RobotFile).arguments(Path(name).parent)
+    except ConfigurationError as error:
+        raise ConfigurationError(
+            f"--env {name} must be a file of a robot, with the keys model and joints: {error}"
+        ) from None
+
+
+def files_of_robot(name: str) -> Iterator[Path]:
+    """The files that a robot's file names, if it is one."""
+    if name.endswith(ENDINGS) and Path(name).is_file():
+        try:
+            arguments = read_robot_file(name)
+        except ConfigurationError:
+            return  # another file
+        yield from (Path(arguments[key]) for key in ("model", "joints") if _is_path(arguments[key]))
+
+
+def _is_path(value: Any) -> bool:
+    return isinstance(value, str)
