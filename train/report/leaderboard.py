@@ -167,7 +167,7 @@ def paired_rows(found: Sequence[Standing]) -> tuple[list[str], list[list[str]]]:
     rows = []
     for s in found:
         if s.is_column and s.training_seeds:
-            rows.append([s.policy, f"{s.scope}, {s.reference}", s.title, said(s.base), said(s.rival)])
+            rows.append([s.policy, f"{s.scope}, {s.reference}", s.title, said(s.base), said(s.rival or s.base)])
     return ["residual", "where", "metric", "against its base", f"against the {BEST_ANALYTIC}"], rows
 
 

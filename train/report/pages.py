@@ -76,7 +76,7 @@ def learning_in_short(results: Results) -> str:
     """What learning adds in the motion that comes first: over its base, and over the best policy without learning."""
     first = results.standings[0].reference
     rows = [
-        [f"{s.policy}, {s.scope}", s.title, said(s.base), said(s.rival)]
+        [f"{s.policy}, {s.scope}", s.title, said(s.base), said(s.rival or s.base)]
         for s in results.standings
         if s.training_seeds and s.reference == first and s.scope in _SHORT
     ]
