@@ -5,6 +5,7 @@ form. Every plan begins with a second of standing, in which policies ramp in, an
 polynomials, which start and end without acceleration.
 """
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -290,6 +291,33 @@ REFERENCES: dict[str, type[AnyReference]] = {
     "multisine": Multisine,
     "steps": Steps,
 }
+
+
+@dataclass(frozen=True)
+class AboutHome:
+    """A reference that every joint follows about its home; of a random one each joint has a plan of its own.
+
+    Attributes:
+        reference: It.
+        home: Of the joints, (n,) [rad].
+    """
+
+    reference: AnyReference
+    home: Array
+
+    @property
+    def is_random(self) -> bool:
+        """Whether every episode has a plan of its own."""
+        return self.reference.is_random
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:
+        """A plan of all joints, (T, n)."""
+        first = self.reference.plan(generator, control_period_s)
+        plans = [first] * len(self.home)
+        if self.is_random:
+            plans[1:] = [self.reference.plan(generator, control_period_s) for _ in plans[1:]]
+        q, q_dot, q_ddot = (np.stack([getattr(p, x) for p in plans], axis=-1) for x in ("q", "q_dot", "q_ddot"))
+        return Plan(q + self.home, q_dot, q_ddot, first.scored, first.rest)
 
 
 def make_reference(

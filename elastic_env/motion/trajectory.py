@@ -1,6 +1,5 @@
 """Plans: sampled trajectories of a reference, their building blocks, and tables of them for many worlds."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,7 +22,7 @@ class Plan:
     """Samples of a reference at the control rate; row k is the target at the end of control period k, row 0 the start.
 
     Attributes:
-        q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,) [rad], [rad/s], [rad/s²].
+        q, q_dot, q_ddot: Angle, rate, acceleration of the link, (T,), or of all links, (T, n) [rad], [rad/s], [rad/s²].
         scored: Rows that count in metrics, (T,).
         rest: Number of the window at rest of `Hold`, −1 elsewhere, (T,).
     """
@@ -120,19 +119,16 @@ class Planned(Protocol):
 class PlanTable(Stateful):
     """The plans of all worlds as tables, one row per control step; a plan without randomness is held once.
 
-    Every joint follows the reference about its home; of one that is random each joint has a plan of its own.
-
     Args:
-        reference: It.
+        reference: Makes plans of all joints, (T, n).
         control_period_s: Time between commands [s].
         num_worlds: How many.
-        home: Of the joints, (n,) [rad].
     """
 
     STATE = ("_motion",)
 
-    def __init__(self, reference: Planned, control_period_s: float, num_worlds: int, home: Array) -> None:
-        self._reference, self._period, self._home = reference, control_period_s, home
+    def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
+        self._reference, self._period = reference, control_period_s
         probe = self._reference.plan(np.random.default_rng(0), self._period)
         self.num_steps = probe.num_steps
         if not probe.scored.any():
@@ -143,13 +139,13 @@ class PlanTable(Stateful):
         self._is_shared = not reference.is_random
         self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
         rows = 1 if self._is_shared else num_worlds
-        self._motion = np.tile(self._of_joints([probe] * len(home)), (rows, 1, 1, 1))
+        self._motion = np.tile(_stacked(probe), (rows, 1, 1, 1))
         self._scored, self._rest = probe.scored, probe.rest
 
     def draw(self, world: int, generator: np.random.Generator) -> None:
         """A new plan for one world."""
         if not self._is_shared:
-            self._motion[world] = self._of_joints([self._reference.plan(generator, self._period) for _ in self._home])
+            self._motion[world] = _stacked(self._reference.plan(generator, self._period))
 
     def at(self, step: IntArray) -> PlanRow:
         """Rows of the given steps, (num_worlds,); beyond the end the last row."""
@@ -157,8 +153,7 @@ class PlanTable(Stateful):
         motion = self._motion[self._row, row]
         return PlanRow(motion[:, 0], motion[:, 1], motion[:, 2], self._scored[row], self._rest[row])
 
-    def _of_joints(self, plans: Sequence[Plan]) -> Array:
-        """Angle, rate and acceleration of a plan for each joint, (T, 3, n)."""
-        motion = np.stack([np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=-1) for plan in plans], axis=-1)
-        motion[:, 0] += self._home
-        return motion
+
+def _stacked(plan: Plan) -> Array:
+    """Angle, rate and acceleration of a plan, (T, 3, n)."""
+    return np.stack([plan.q, plan.q_dot, plan.q_ddot], axis=1)

@@ -18,12 +18,20 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.end_effector import EndEffector
 from elastic_env.dynamics.tree_torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.joint.make_elastic import transformed
-from elastic_env.motion.references import AnyReference, make_reference
+from elastic_env.motion.arm_references import (
+    AnyArmReference,
+    ArmMotion,
+    ArmReference,
+    OfArm,
+    Workspace,
+    make_arm_reference,
+)
+from elastic_env.motion.references import Multisine
 from elastic_env.registration import Robot, require_models
 from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
@@ -38,6 +46,8 @@ _ENLARGED = 8.0
 """Factor by which a picture enlarges deviations from the reference."""
 _REFERENCE, _REFERENCE_RGBA = "elastic_env_reference_", (0.35, 0.65, 0.45, 0.35)
 """Prefix and colour of the robot that is the reference."""
+_SPARE = 0.8
+"""Share of the servos' torque that poses may need at rest."""
 _POINT = 1e-4
 """Moment of inertia of a point mass over its mass: that of a ball of 16 mm [m²]."""
 _RIGID_NM_PER_RAD = 1e15
@@ -46,6 +56,8 @@ _RIGID_NM_PER_RAD = 1e15
 
 class JointRobotConfig(JointConfig):
     """All of the environment of a robot of one's own."""
+
+    reference: ArmReference = Multisine()  # pyright: ignore[reportIncompatibleVariableOverride]
 
     joints: dict[str, ElasticJoint]
     """The joints as they are known; the scenario says in what the true ones differ."""
@@ -92,7 +104,7 @@ class JointRobot:
 
     def configure(
         self,
-        reference: str | dict[str, Any] | AnyReference = "multisine",
+        reference: str | dict[str, Any] | AnyArmReference = "multisine",
         scenario: str | Scenario = "nominal",
         stiffness: float | str | Path | list[float] | None = None,
         form: Literal["tendon", "rigid"] = "tendon",
@@ -103,7 +115,8 @@ class JointRobot:
         """The configuration from the arguments of `gymnasium.make`.
 
         Args:
-            reference: "sine", "multisine", "steps", "hold", a mapping with `kind` and parameters, or a reference model.
+            reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind`
+                and parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
             scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
             stiffness: K of the joints [N·m/rad], one number or one per joint; default that of the joints.
             form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
@@ -119,7 +132,7 @@ class JointRobot:
         if stiffness is not None:
             joints = with_stiffness(joints, read_stiffness(stiffness))
         return JointRobotConfig(
-            reference=make_reference(reference),
+            reference=make_arm_reference(reference),
             scenario=make_scenario(scenario, walks=False),
             joints=joints,
             form=form,
@@ -139,12 +152,13 @@ class JointRobot:
         home = np.zeros(len(true.joints)) if self.home is None else np.array(self.home, dtype=np.float64)
         if home.shape != (len(true.joints),):
             raise ConfigurationError(f"home must have one angle per joint, {len(true.joints)}, got {len(home)}")
-        _require_feasible(config, true, body, home)
-        assumed = RobotModel(_known_joints(config), self.rigid().compile(), config.control_period_s)
         tool = None if self.end_effector is None else EndEffector(true.rigid, true.joint_names, self.end_effector)
+        motion = ArmMotion(config.reference, _workspace(true, body, home, tool))
+        _require_feasible(config, true, body, motion)
+        assumed = RobotModel(_known_joints(config), self.rigid().compile(), config.control_period_s)
         return JointPlant(
             name=self.name, model=self.elastic(config).compile(), assumed=assumed, true=true,
-            static_torque=body.gravity_torque, home=home,
+            static_torque=body.gravity_torque, motion=motion,
             rest_angle=partial(_rest_angle, stiffness=true.rest_stiffness(config.form), true=true, body=body),
             end_effector=tool,
         )  # fmt: skip
@@ -266,16 +280,36 @@ def _carrying(spec: mujoco.MjSpec, end_effector: str | None, mass: float) -> muj
     return spec
 
 
-def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: TreeTorque, home: Array) -> None:
-    """Refuse a reference that the servos cannot follow, by a plan of it."""
-    plan = config.reference.plan(np.random.default_rng(0), config.control_period_s)
-    rows = slice(None, None, max(plan.num_steps // 500, 1))
-    q, q_dot, q_ddot = (np.tile(x[rows, None], (1, len(home))) for x in (plan.q, plan.q_dot, plan.q_ddot))
-    _require_in_range(config, robot, q + home)
-    motion = body.inverse_dynamics(q + home, q_dot, q_ddot) + robot.rotor_inertia * q_ddot
-    friction = robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
+def _workspace(robot: RobotModel, body: TreeTorque, home: Array, tool: EndEffector | None) -> Workspace:
+    """What references have to know of a robot, by its true model."""
+    at = [int(robot.rigid.joint(name).id) for name in robot.joint_names]
+    ranges = np.where(robot.rigid.jnt_limited[at].astype(bool)[:, None], robot.rigid.jnt_range[at], [-np.inf, np.inf])
+    return Workspace(tuple(robot.joint_names), ranges[:, 0], ranges[:, 1], home, partial(_holds, robot, body), tool)
+
+
+def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
+    """Whether servos hold poses with a fifth of their torque to spare, from (..., n) [rad] to (...)."""
     limits = np.array([servo.torque_limit for servo in robot.servos])
-    require_torque(config.reference, np.abs(motion).max(axis=0) + friction, limits)
+    return np.all(np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1)
+
+
+def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: TreeTorque, motion: ArmMotion) -> None:
+    """Refuse a reference that the servos cannot follow, or beyond a joint's range, by a plan of it."""
+    plan = motion.plan(np.random.default_rng(0), config.control_period_s)
+    rows = slice(None, None, max(plan.num_steps // 500, 1))
+    q, q_dot, q_ddot = (np.ascontiguousarray(x[rows]) for x in (plan.q, plan.q_dot, plan.q_ddot))
+    _require_in_range(config, robot, q)
+    needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(axis=0)
+    needed += robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
+    limits = np.array([servo.torque_limit for servo in robot.servos])
+    if not isinstance(config.reference, OfArm):
+        require_torque(config.reference, needed, limits)
+    elif np.any(needed > limits):
+        weakest = int(np.argmax(needed - limits))
+        raise ConfigurationError(
+            f"the reference {config.reference.kind!r} can need {needed[weakest]:.1f} N·m of the servo of joint "
+            f"{robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.1f} N·m; make its moves slower"
+        )
 
 
 def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> None:

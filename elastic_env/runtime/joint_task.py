@@ -22,7 +22,7 @@ from elastic_env.dynamics.end_effector import EndEffector
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.joint.time_step import require_stable
-from elastic_env.motion.trajectory import PlanTable
+from elastic_env.motion.trajectory import Planned, PlanTable
 from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
 from elastic_env.runtime.joint_config import JointConfig
 from elastic_env.runtime.metrics import Metric
@@ -78,7 +78,7 @@ class JointPlant:
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
         rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad].
-        home: Added to the reference of each joint, (n,) [rad].
+        motion: The reference as all joints follow it.
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
             q = 0 [m]; None where there is no such IMU.
         end_effector: Whose place and tilt are scored; None where the joints alone are.
@@ -90,7 +90,7 @@ class JointPlant:
     true: RobotModel
     static_torque: Callable[[Array], Array]
     rest_angle: Callable[[Array], Array]
-    home: Array
+    motion: Planned
     imu_arm_m: float | None = None
     end_effector: EndEffector | None = None
 
@@ -258,7 +258,7 @@ class JointTask(Stateful):
         self._inputs = np.array([servo.id for servo in servos])
         self._integrators = np.array([servo.actadr[0] for servo in servos])
         self._noise, self._imu = NoiseStream(num_worlds, NOISE), _inertial_imu(config, plant, num_worlds)
-        self._reference = PlanTable(config.reference, config.control_period_s, num_worlds, plant.home)
+        self._reference = PlanTable(plant.motion, config.control_period_s, num_worlds)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._present = self._coming = self._reference.at(self._step)
         self._state = JointState(*np.zeros((4, num_worlds, n)))

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 from elastic_env import IDS
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.motion.arm_references import make_arm_reference
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
 from elastic_env.robots.joint_robot import JointRobot
@@ -274,6 +275,7 @@ _TESTBED = Environment(
 _JOINTS = replace(
     _TESTBED,
     default_reference="multisine",
+    draws=lambda reference: make_arm_reference(reference).is_random,  # pyright: ignore[reportArgumentType]
     columns=tuple(column for column in _TESTBED.columns if not column.title.startswith("IMU")),
     traced=("time_s", "link_error", "deflection", "joint_torque", "command_rate"),
     figures=(),
@@ -373,7 +375,7 @@ _HARDWARE = replace(
 
 _OWN = {
     "testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE,
-    "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"]),
+    "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"], default_reference="poses"),
 }  # fmt: skip
 ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known) for name, known in IDS.items()}
 """Environments by their short names: those with figures of their own, and other robots of elastic joints."""

@@ -15,7 +15,7 @@ from elastic_env.dynamics.end_effector import outermost_body
 from elastic_env.joint.frozen import frozen, require_fixed_base
 from elastic_env.joint.model_file import compiled_spec
 from elastic_env.joint.time_step import stable_timestep
-from elastic_env.motion.references import AnyReference
+from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot
 from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
 from elastic_env.robots.robot import ID, NAME
@@ -42,7 +42,7 @@ class RobotConfig(JointRobotConfig):
 def configure_robot(
     model: GivenModel | None = None,
     joints: GivenJoints | None = None,
-    reference: str | dict[str, Any] | AnyReference = "multisine",
+    reference: str | dict[str, Any] | AnyArmReference = "poses",
     scenario: str | Scenario = "nominal",
     end_effector: str | None = None,
     home: Mapping[str, float] | Sequence[float] | None = None,
@@ -61,7 +61,8 @@ def configure_robot(
             made-up arm of four joints.
         joints: YAML file or mapping of the elastic joints by name or pattern, see `elastic_env.robots.robot.joints`.
             All other joints are held where the model's first keyframe has them, or at its reference.
-        reference: "sine", "multisine", "steps", "hold", a mapping with `kind` and parameters, or a reference model.
+        reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind` and
+            parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
         scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
         end_effector: Site or body whose place and tilt are scored; default the outermost body.
         home: Angle about which each joint follows the reference, by name or in order [rad]; default the model's first

@@ -8,6 +8,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
+from elastic_env.motion.references import AboutHome
 from elastic_env.robots.testbed import NAME
 from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, imu_arm, rigid_spec
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
@@ -53,8 +54,8 @@ def plant(config: TestbedConfig) -> JointPlant:
     return JointPlant(
         name=NAME, model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
         true=true, static_torque=pendulum.torque,
-        rest_angle=partial(_rest_angle, stiffness=stiffness, joint=joint, pendulum=pendulum), home=np.zeros(1),
-        imu_arm_m=imu_arm(pendulum),
+        rest_angle=partial(_rest_angle, stiffness=stiffness, joint=joint, pendulum=pendulum),
+        motion=AboutHome(config.reference, np.zeros(1)), imu_arm_m=imu_arm(pendulum),
     )  # fmt: skip
 
 

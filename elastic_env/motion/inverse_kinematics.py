@@ -1,0 +1,63 @@
+"""Joint angles whose end effector follows a path, by Newton's method from point to point when a motion is planned."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.end_effector import EndEffector
+
+_POINTS = 100
+"""Points of a path per unit of its parameter."""
+_ENOUGH, _MOST_STEPS = 1e-9, 50
+_LARGEST_JUMP_RAD = 0.3
+"""Between two points of a path; a larger one is a singular posture."""
+_DAMPING = 1e-12
+_FOR_ORIENTATION = 6
+"""Joints that a robot needs to keep the orientation of its tool."""
+
+
+def joint_path(tool: EndEffector, home: Array, place: Callable[[Array], Array], end: float) -> CubicSpline:
+    """Joint angles along a path of the end effector, from (...) to (..., n) [rad].
+
+    Args:
+        tool: The end effector.
+        home: Joint angles at the start, (n,) [rad].
+        place: Where the end effector is relative to its start, from (...) to (..., 3) [m].
+        end: Last value of the path's parameter, which starts at 0.
+
+    Raises:
+        ConfigurationError: The path leaves the workspace, or leads through a singular posture.
+    """
+    s = np.linspace(0.0, end, int(np.ceil(_POINTS * end)) + 1)
+    start, R = tool.pose(home)
+    angles = [home]
+    for at, offset in zip(s[1:], place(s[1:]), strict=True):
+        found = _solved(tool, angles[-1], start + offset, R)
+        if found is None or np.abs(found - angles[-1]).max() > _LARGEST_JUMP_RAD:
+            raise ConfigurationError(
+                f"the end effector cannot follow the path beyond {100 * at / end:.0f} % of it, "
+                f"{offset.round(3).tolist()} m from its start: out of reach, or a singular posture; choose a smaller "
+                "path or another home"
+            )
+        angles.append(found)
+    return CubicSpline(s, np.array(angles))
+
+
+def _solved(tool: EndEffector, q: Array, wanted: Array, R_wanted: Array) -> Array | None:
+    """Angles near q with the end effector in a place, and of six joints or more in an orientation; None for none."""
+    keeps = len(q) >= _FOR_ORIENTATION
+    for _ in range(_MOST_STEPS):
+        position, R = tool.pose(q)
+        turn = Rotation.from_matrix(R_wanted @ R.T).as_rotvec() if keeps else np.zeros(0)
+        error = np.concatenate([wanted - position, turn])
+        if np.abs(error).max() < _ENOUGH:
+            return q
+        moved, turned = tool.jacobian(q)
+        J = np.concatenate([moved, turned]) if keeps else moved
+        step: Array = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(len(J)), error)
+        q = q + step
+    return None
