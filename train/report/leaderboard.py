@@ -172,11 +172,16 @@ def paired_rows(found: Sequence[Standing]) -> tuple[list[str], list[list[str]]]:
 
 
 def said(paired: Paired | None) -> str:
-    """A paired change in words: the change, its interval, a star where nothing is shown, and whom it compares with."""
+    """A paired change in words: as `changed`, and whom it compares with."""
+    return "-" if paired is None else f"{changed(paired)} ({paired.to})"
+
+
+def changed(paired: Paired | None) -> str:
+    """A paired change: its value, its interval, and a star where nothing is shown."""
     if paired is None:
         return "-"
     star = "" if paired.verdict in ("lower", "higher") or not math.isfinite(paired.change.value) else " *"
-    return f"{percent_interval(paired.change)}{star} ({paired.to})"
+    return f"{percent_interval(paired.change)}{star}"
 
 
 LEGEND = (

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
+from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
-from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard, said
+from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -75,13 +76,20 @@ def walks_beside_the_paper(results: Results) -> str:
 def learning_in_short(results: Results) -> str:
     """What learning adds in the motion that comes first: over its base, and over the best policy without learning."""
     first = results.standings[0].reference
+    found = [s for s in results.standings if s.training_seeds and s.reference == first and s.scope in _SHORT]
+    titles = list(dict.fromkeys(s.title for s in found))
     rows = [
-        [f"{s.policy}, {s.scope}", s.title, said(s.base), said(s.rival or s.base)]
-        for s in results.standings
-        if s.training_seeds and s.reference == first and s.scope in _SHORT
+        [f"{policy}, {scope}", *(shown for title in titles for shown in _over(own, title))]
+        for (policy, scope), own in grouped(found, lambda s: (s.policy, s.scope)).items()
     ]
-    head = ["", f"step period {first}", "(a) over its base", "(b) over the best policy without learning"]
-    return markdown_table(head, ["---"] * 2 + ["---:"] * 2, rows) + "\n"
+    head = [f"step period {first}", *(f"{title}, ({over})" for title in titles for over in "ab")]
+    return markdown_table(head, ["---", *["---:"] * 2 * len(titles)], rows) + "\n"
+
+
+def _over(standings: Sequence[Standing], title: str) -> tuple[str, str]:
+    """The change in a metric over the base, and over the best policy without learning, which may be the base."""
+    own = next(s for s in standings if s.title == title)
+    return changed(own.base), "as (a)" if own.rival is None else changed(own.rival)
 
 
 def gallery_table(results: Results) -> str:
