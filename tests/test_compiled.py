@@ -27,7 +27,7 @@ from elastic_env.runtime import metrics, worlds
 ROOT = Path(__file__).parents[1]
 KERNELS = (
     "elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels",
-    "elastic_env.dynamics.tree_kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.end_effector",
+    "elastic_env.dynamics.tree.kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.tree.end_effector",
     "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
     "baselines.estimation.estimation_kernels",
 )  # fmt: skip

@@ -17,7 +17,7 @@ import pytest
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree_torque import TreeTorque
+from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.make_elastic import make_elastic, transformed

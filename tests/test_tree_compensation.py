@@ -11,7 +11,7 @@ from baselines.compensation.compensators import GravityCompensator, Motion
 from baselines.compensation.gravity_torque import make_gravity
 from elastic_env import ElasticJoint, JointRobot, Servo
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.dynamics.tree_torque import TreeTorque
+from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.runtime.robot_model import RobotModel
 from tests.played import metrics_of
 

@@ -13,7 +13,7 @@ from baselines.compensation.contact_torque import ContactGravity, ContactMethod,
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.rigid_body import RigidBody
-from elastic_env.dynamics.tree_torque import TreeTorque, needs_more_than_gravity
+from elastic_env.dynamics.tree.torque import TreeTorque, needs_more_than_gravity
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 GravityMethod = Literal["hinge", "tree", "com", "ankle", "lumped"]

@@ -22,7 +22,7 @@ from scipy.linalg import get_lapack_funcs
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.tree_torque import TreeTorque
+from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.model_file import compiled_model
 from elastic_env.motion.trajectory import minimum_jerk
 

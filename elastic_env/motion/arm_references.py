@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity
 from elastic_env.core.errors import ConfigurationError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.end_effector import EndEffector
+from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import REFERENCES, AboutHome, Hold, Multisine, Sine, Steps, make_reference
 from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic

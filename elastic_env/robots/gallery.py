@@ -20,7 +20,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree_torque import TreeTorque
+from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.model_file import keep_shapes, urdf_spec, xml_of
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.end_effector import EndEffector
-from elastic_env.dynamics.tree_torque import TreeTorque
+from elastic_env.dynamics.tree.end_effector import EndEffector
+from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.joint.make_elastic import transformed
 from elastic_env.motion.arm_references import (

@@ -18,7 +18,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
 from elastic_env.core.state import Stateful
-from elastic_env.dynamics.end_effector import EndEffector
+from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name
 from elastic_env.joint.time_step import require_stable

@@ -20,7 +20,7 @@ import numpy as np  # noqa: E402
 
 from baselines import PositionCompensator  # noqa: E402
 from elastic_env.core.signals import Array  # noqa: E402
-from elastic_env.dynamics.tree_torque import TreeTorque  # noqa: E402
+from elastic_env.dynamics.tree.torque import TreeTorque  # noqa: E402
 from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
 from elastic_env.rendering.picture import Image, set_stage  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402

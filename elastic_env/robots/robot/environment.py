@@ -11,7 +11,7 @@ from typing import Any, Literal
 import mujoco
 
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.dynamics.end_effector import outermost_body
+from elastic_env.dynamics.tree.end_effector import outermost_body
 from elastic_env.joint.frozen import frozen, require_fixed_base
 from elastic_env.joint.model_file import compiled_spec
 from elastic_env.joint.time_step import stable_timestep

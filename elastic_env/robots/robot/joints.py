@@ -12,8 +12,8 @@ import numpy as np
 from elastic_env.core.config import Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.end_effector import outermost_body
-from elastic_env.dynamics.tree_torque import TreeTorque
+from elastic_env.dynamics.tree.end_effector import outermost_body
+from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.frozen import home_of
 
