@@ -36,9 +36,9 @@ from train.report.leaderboard import (
     three_digits,
     write_leaderboard,
 )
+from train.report.pages import marks, page_with, pages
 from train.report.pages import Results as PageResults
 from train.report.pages import main as write_pages
-from train.report.pages import marks, page_with, pages
 from train.runs.folders import run_folder
 
 ROOT = Path(__file__).parents[1]
@@ -221,7 +221,7 @@ def checkout() -> PageResults:
     results = Path("docs", "results")
     results.mkdir(parents=True)
     write_leaderboard(rows(), results)
-    for table in ("demo_episodes.csv", "gallery.csv"):
+    for table in [*TABLES, *(f"{name}.csv" for name in MAPS)]:
         shutil.copy(ROOT / "docs" / "results" / table, results)
     return PageResults.read(results)
 

@@ -9,13 +9,15 @@ writes every part anew. A test fails where a page and the results disagree.
 import csv
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
+from train.report.learned_pages import MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -27,6 +29,14 @@ _SHORT = ("mixture", "held out")
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
+TABLES = {
+    "demo_episodes.csv": "copy it from runs/demo/episodes.csv after `elastic demo`",
+    "gallery.csv": "python -m train.experiments.gallery writes it",
+    "learned_posture.csv": "copy it from statistics.csv after `elastic compare configs/learned_posture.yaml`",
+}
+"""Tables of the results, and where they come from."""
+
+
 @dataclass(frozen=True)
 class Results:
     """The results that pages show.
@@ -35,26 +45,29 @@ class Results:
         standings: Rows of the leaderboard.
         walks: Episodes of `elastic demo`, a column of `episodes.csv` by its name.
         gallery: Robots of the gallery, a column of `gallery.csv` by its name.
+        learned: Changes by the residual on `adaptive_posture`, a column of `statistics.csv` by its name.
+        maps: Maps of what learning adds, by the name of their file.
     """
 
     standings: Sequence[Standing]
     walks: Sequence[Mapping[str, str]]
     gallery: Sequence[Mapping[str, str]] = ()
+    learned: Sequence[Mapping[str, str]] = ()
+    maps: Mapping[str, Sequence[LearnedMap]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, folder: Path) -> "Results":
-        """From a folder with `leaderboard.csv`, `demo_episodes.csv` and `gallery.csv`.
+        """From a folder with the tables that `TABLES` names, `leaderboard.csv` and the maps.
 
         Raises:
             ConfigurationError: A table is missing, or not one of ours.
         """
-        walks = folder / "demo_episodes.csv"
-        if not walks.is_file():
-            raise ConfigurationError(f"{walks} is missing; copy it from runs/demo/episodes.csv after `elastic demo`")
-        gallery = folder / "gallery.csv"
-        if not gallery.is_file():
-            raise ConfigurationError(f"{gallery} is missing; python -m train.experiments.gallery writes it")
-        return cls(read_leaderboard(folder / "leaderboard.csv"), _rows(walks), _rows(gallery))
+        for name, source in TABLES.items():
+            if not (folder / name).is_file():
+                raise ConfigurationError(f"{folder / name} is missing; {source}")
+        maps = {name: learned_maps(folder / f"{name}.csv") for name in MAPS}
+        walks, gallery, learned = (_rows(folder / name) for name in TABLES)
+        return cls(read_leaderboard(folder / "leaderboard.csv"), walks, gallery, learned, maps)
 
 
 def _rows(table: Path) -> list[dict[str, str]]:
@@ -117,6 +130,10 @@ def gallery_pictures(results: Results) -> str:
     )
 
 
+def _map_part(name: str, results: Results) -> str:
+    return maps_markdown(results.maps[name])
+
+
 PARTS: Mapping[str, Callable[[Results], str]] = {
     "leaderboard": lambda results: leaderboard_markdown(results.standings),
     "what learning adds": lambda results: claims_markdown(results.standings),
@@ -124,6 +141,8 @@ PARTS: Mapping[str, Callable[[Results], str]] = {
     "walks beside the paper": walks_beside_the_paper,
     "gallery": gallery_table,
     "gallery pictures": gallery_pictures,
+    "learned posture": lambda results: changes_table(results.learned),
+    **{name: partial(_map_part, name) for name in MAPS},
 }
 """Parts of pages by the name of their marks."""
 

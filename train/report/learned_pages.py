@@ -1,0 +1,119 @@
+"""What learning adds as tables of a page, from the `statistics.csv` or the `map.csv` that a comparison wrote."""
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from elastic_env.core.errors import ConfigurationError
+from train.evaluate.changes import percent, percent_interval
+from train.evaluate.statistics import Estimate
+from train.runs.escaping import markdown_table
+
+_METRICS = {"pelvis_error_rms_rad": ("pelvis error", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm")}
+"""Metrics that pages show, with the unit of their tables."""
+MAPS: tuple[str, ...] = ()
+"""Configurations of the maps that pages show."""
+_SHOWN = ("lower", "higher")
+"""Verdicts of a change that chance does not explain."""
+
+
+@dataclass(frozen=True)
+class LearnedMap:
+    """The change by a residual against the best policy without learning, over two axes, in one metric.
+
+    Attributes:
+        title: Motion and scenario.
+        metric: Column of the episodes.
+        residual: Title of the residual.
+        x_is, y_is: What the axes are.
+        x, y: Their values as they are shown.
+        cells: Row of the CSV by (x, y).
+    """
+
+    title: str
+    metric: str
+    residual: str
+    x_is: str
+    y_is: str
+    x: Sequence[str]
+    y: Sequence[str]
+    cells: Mapping[tuple[str, str], Mapping[str, str]]
+
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[str, str]]) -> "LearnedMap":
+        """From the rows of one map, metric and residual."""
+        first = rows[0]
+        return cls(
+            first["map"], first["metric"], first["policy"], first["x_is"], first["y_is"],
+            list(dict.fromkeys(row["x"] for row in rows)), list(dict.fromkeys(row["y"] for row in rows)),
+            {(row["x"], row["y"]): row for row in rows},
+        )  # fmt: skip
+
+    @property
+    def table(self) -> str:
+        """Changes with x to the right and y upwards."""
+        head = [f"{self.y_is} \\ {self.x_is}", *self.x]
+        rows = [[f"**{y}**", *(_change(self.cells[x, y]) for x in self.x)] for y in reversed(self.y)]
+        return markdown_table(head, ["---:"] * len(head), rows)
+
+    @property
+    def sentence(self) -> str:
+        """In how many cells the residual is ahead and behind, and whom it is compared with."""
+        verdicts = [row["verdict"] for row in self.cells.values()]
+        rivals = [row["best_without_learning"] for row in self.cells.values()]
+        title, _ = _METRICS[self.metric]
+        common = max(dict.fromkeys(rivals), key=rivals.count)
+        return (
+            f"**{title[:1].upper()}{title[1:]}.** Ahead in {verdicts.count('lower')} of {len(verdicts)} cells, "
+            f"behind in {verdicts.count('higher')}. The best policy without learning is {common} in "
+            f"{rivals.count(common)} of {len(rivals)} cells."
+        )
+
+
+def learned_maps(path: Path) -> list[LearnedMap]:
+    """The maps of all residuals in a `map.csv`.
+
+    Raises:
+        ConfigurationError: It is missing, or has no residual.
+    """
+    if not path.is_file():
+        raise ConfigurationError(f"{path} is missing; copy it from the run of elastic compare configs/{path.stem}.yaml")
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["verdict"]]
+    if not rows:
+        raise ConfigurationError(f"{path} compares no residual; a map of learning needs one among its policies")
+    keys = dict.fromkeys((row["map"], row["metric"], row["policy"]) for row in rows)
+    return [LearnedMap.of([row for row in rows if (row["map"], row["metric"], row["policy"]) == key]) for key in keys]
+
+
+def maps_markdown(maps: Iterable[LearnedMap]) -> str:
+    """A sentence and a table for each map."""
+    return "\n".join(f"{each.sentence}\n\n{each.table}\n" for each in maps)
+
+
+def changes_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Paired changes of a residual over its base in every scenario and group, from the rows of a `statistics.csv`."""
+    own = [row for row in rows if row["base_is"] == "base of the residual" and row["metric"] in _METRICS]
+    scopes = dict.fromkeys(row["scope"] for row in own)
+    lines = []
+    for scope in scopes:
+        found = {row["metric"]: row for row in own if row["scope"] == scope}
+        cells = (part for metric, (_, unit) in _METRICS.items() for part in _over_base(found[metric], unit))
+        lines.append([f"**{scope}**" if found[next(iter(_METRICS))]["pooled"] == "True" else f"`{scope}`", *cells])
+    head = ["", *(text for title, unit in _METRICS.values() for text in (f"base: {title} [{unit}]", "change"))]
+    return markdown_table(head, ["---", *["---:"] * 4], lines) + "\n"
+
+
+def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
+    """Mean of the base in milli-units, and the change with its interval and a star where that includes zero."""
+    change = Estimate(*(float(row[name]) for name in ("change", "change_low", "change_high")))
+    star = " *" if float(row["change_low"]) <= 0.0 <= float(row["change_high"]) else ""
+    return f"{1e3 * float(row['base_mean']):.{2 if unit == 'mrad' else 1}f}", f"{percent_interval(change)}{star}"
+
+
+def _change(row: Mapping[str, str]) -> str:
+    """Relative change, with a star where chance explains it, and ✕ where a policy failed."""
+    star = "" if row["verdict"] in _SHOWN else " *"
+    failed = f" ✕{row['failed']}" if row["failed"] not in ("", "0") else ""
+    return f"{percent(float(row['change']))}{star}{failed}" if row["change"] else "-"
