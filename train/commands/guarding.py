@@ -41,12 +41,16 @@ class Speed:
     under the vector environments of Gymnasium and SB3 too; and PPO end to end.
 
     Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024 --no-others --no-ppo
+
+    With --real-time one policy is timed alone, as on a robot: it is called with recorded observations, once in every
+    control period. Printed are late cycles and latencies. Example: elastic speed --real-time --policy dynamic
     """
 
     env: str = "walker"
     """Environment: testbed or walker."""
     policy: str | None = None
-    """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the testbed."""
+    """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the testbed; with
+    --real-time adaptive_posture on the walker."""
     num_envs: list[int] = field(default_factory=lambda: [64, 256])
     """Numbers of worlds."""
     others: bool = True
@@ -63,14 +67,28 @@ class Speed:
     """Rounds; medians are reported."""
     threads: int = 0
     """Threads of both contenders, 0 for all cores."""
+    real_time: bool = False
+    """Time a policy alone against the clock, in place of all that; reads env, policy, seconds and output alone."""
+    seconds: float = 60.0
+    """How long, with --real-time [s]."""
     output: Path | None = None
-    """Folder for speed.json, new or empty; default runs/speed, numbered if taken."""
+    """Folder for speed.json or real_time.json, new or empty; default runs/speed, numbered if taken."""
 
     def run(self) -> None:
         """Measure and report."""
+        if self.real_time:
+            self._run_real_time()
+            return
         from train.speed.speed import SpeedConfig, measure_all
 
         with options_named():
-            given = {name: value for name, value in vars(self).items() if name not in ("output", "profile")}
+            given = {name: value for name, value in vars(self).items() if name in SpeedConfig.model_fields}
             config = SpeedConfig(**given)
         CONSOLE.print(f"wrote {measure_all(config, CONSOLE, self.output, self.profile)}", soft_wrap=True)
+
+    def _run_real_time(self) -> None:
+        from train.speed.real_time import RealTimeConfig, measure_real_time
+
+        with options_named():
+            config = RealTimeConfig(env=self.env, policy=self.policy, seconds=self.seconds)
+        CONSOLE.print(f"wrote {measure_real_time(config, CONSOLE, self.output)}", soft_wrap=True)

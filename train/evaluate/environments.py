@@ -98,6 +98,7 @@ class Environment:
         default_reference: Reference where none is named.
         watched_reference: The same for a picture; None for the default.
         looped_policy: Policy in the loop of which the speed is measured, the best that needs no truth.
+        live_policy: Policy that is timed against the clock; None for the looped one.
         on_hardware: Short name of the same robot on hardware; empty where there is none.
         arguments: Arguments of `gymnasium.make` for a reference.
         label: How tables and figures call a reference.
@@ -146,6 +147,7 @@ class Environment:
     walks: bool = False
     watched_reference: Reference | None = None
     looped_policy: str = "zero"
+    live_policy: str | None = None
     on_hardware: str = ""
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
@@ -361,6 +363,7 @@ _WALKER = Environment(
     failure="falls",
     walks=True,
     looped_policy="input_wrench",
+    live_policy="adaptive_posture",
 )  # fmt: skip
 
 _HARDWARE = replace(

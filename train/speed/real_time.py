@@ -1,0 +1,183 @@
+"""A policy against the clock: whether its command is ready within the control period, as on a robot."""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.signals import Array
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.environments import environment
+from train.evaluate.evaluate import blamed, make_policy
+from train.runs.folders import run_folder
+
+_PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
+
+
+class RealTimeConfig(Model):
+    """What `elastic speed --real-time` plays."""
+
+    env: str = "walker"
+    policy: str | None = None
+    """Policy that is timed; None for adaptive_posture on the walker, input on the testbed."""
+    seconds: float = quantity("s", 60.0, gt=0.0, le=86_400.0, description="how long it is played against the clock")
+
+
+@dataclass(frozen=True)
+class RealTimeResult:
+    """What a policy kept of its time.
+
+    The latency of a cycle is the time from the moment at which it is due to the moment at which its command is ready.
+    So it has the delay with which the system wakes the program. The time in the policy is without that.
+
+    Attributes:
+        env: Environment.
+        policy: What was timed.
+        period_us: Control period.
+        cycles: Commands.
+        late: Those that were not ready when the next one was due.
+        late_share: Their share, from 0 to 1.
+        latency_median_us: Median latency.
+        latency_p99_us: The latency that 99 % of the cycles do not exceed.
+        latency_p999_us: The same of 99.9 %.
+        latency_max_us: Longest latency.
+        policy_median_us: Median time in the policy.
+        policy_p99_us: The time in the policy that 99 % of the cycles do not exceed.
+        policy_p999_us: The same of 99.9 %.
+        policy_max_us: Longest time in the policy.
+    """
+
+    env: str
+    policy: str
+    period_us: float
+    cycles: int
+    late: int
+    late_share: float
+    latency_median_us: float
+    latency_p99_us: float
+    latency_p999_us: float
+    latency_max_us: float
+    policy_median_us: float
+    policy_p99_us: float
+    policy_p999_us: float
+    policy_max_us: float
+
+
+def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
+    """Record what the policy observes in an episode, then call it with that once in every control period.
+
+    The episode begins again, with a policy that remembers nothing, where it is shorter than what is to be played.
+
+    Raises:
+        ConfigurationError: Environment or policy does not exist.
+        PolicyFailedError: The policy failed.
+    """
+    known = environment(config.env)
+    name = config.policy or known.live_policy or known.looped_policy
+    condition = Condition(env=config.env, policy=PolicySpec(name=name), reference=known.default_reference)
+    env = gymnasium.make(condition.environment.id, **condition.arguments)
+    try:
+        policy = make_policy(condition.policy, env)
+        period_s = env.unwrapped.assumed_model.control_period_s  # type: ignore[attr-defined]
+        cycles = max(round(config.seconds / period_s), 1)
+        with blamed(condition):
+            observations = _recorded(env, policy, cycles)
+            latency_s, policy_s = _timed(policy, observations, cycles, period_s)
+    finally:
+        env.close()
+    return summary(config.env, name, period_s, latency_s, policy_s)
+
+
+def _recorded(env: Any, policy: Any, most: int) -> list[Any]:
+    """Observations of an episode with the policy in its loop, at most so many."""
+    observation, _ = env.reset(seed=0)
+    found, state, start, is_over = [observation], None, np.array(True), False
+    while not is_over and len(found) < most:
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        observation, _, terminated, truncated, _ = env.step(action)
+        start, is_over = np.array(False), terminated or truncated
+        found.append(observation)
+    return found
+
+
+def _timed(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:
+    """Latency and time in the policy, (cycles,) [s]; a cycle that begins late is not left out."""
+    latency_s, policy_s = np.empty(cycles), np.empty(cycles)
+    state: Any = None
+    begin = time.perf_counter() + period_s
+    for number, (index, observation) in enumerate(islice(cycle(enumerate(observations)), cycles)):
+        due, memory, start = begin + number * period_s, state if index else None, np.array(index == 0)
+        remaining = due - time.perf_counter()
+        if remaining > 0.0:
+            time.sleep(remaining)
+        called = time.perf_counter()
+        _, state = policy.predict(observation, state=memory, episode_start=start, deterministic=True)
+        ready = time.perf_counter()
+        latency_s[number], policy_s[number] = ready - due, ready - called
+    return latency_s, policy_s
+
+
+def summary(env: str, policy: str, period_s: float, latency_s: Array, policy_s: Array) -> RealTimeResult:
+    """Share of late cycles, and percentiles.
+
+    Args:
+        env: Environment.
+        policy: What was timed.
+        period_s: Control period [s].
+        latency_s: Time from when a cycle was due until its command was ready, (cycles,) [s].
+        policy_s: Time in the policy, (cycles,) [s].
+    """
+    late = int(np.count_nonzero(latency_s > period_s))
+    figures = {
+        f"{title}_{name}_us": 1e6 * float(np.percentile(values, percentile))
+        for title, values in (("latency", latency_s), ("policy", policy_s))
+        for name, percentile in (*_PERCENTILES.items(), ("max", 100.0))
+    }
+    return RealTimeResult(
+        env=env, policy=policy, period_us=1e6 * period_s, cycles=len(latency_s), late=late,
+        late_share=late / len(latency_s), **figures,
+    )  # fmt: skip
+
+
+def measure_real_time(config: RealTimeConfig, console: Console, output: Path | None = None) -> Path:
+    """Play, print the latencies, and write them as JSON.
+
+    Args:
+        config: What to play.
+        console: Where the table goes.
+        output: Folder for the result; default runs/speed, numbered if taken.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigurationError: Environment or policy does not exist.
+        PolicyFailedError: The policy failed.
+        ResultsExistError: The output folder holds results.
+    """
+    with run_folder("speed", config.model_dump(mode="json"), 0, output) as folder:
+        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
+        result = play_against_the_clock(config)
+        path = folder / "real_time.json"
+        path.write_text(json.dumps(asdict(result), indent=2) + "\n")
+    console.print(_table(result))
+    console.print(f"late: {result.late} of {result.cycles} cycles, {100.0 * result.late_share:.3f} %", highlight=False)
+    return path
+
+
+def _table(result: RealTimeResult) -> Table:
+    table = Table(title=f"{result.policy} on the {result.env}, once in {result.period_us:.0f} µs; times in µs")
+    for name in ("", "median", "99 %", "99.9 %", "longest"):
+        table.add_column(name, justify="right" if name else "left")
+    figures = asdict(result)
+    for title, key in (("from due to command", "latency"), ("in the policy", "policy")):
+        table.add_row(title, *(f"{figures[f'{key}_{name}_us']:.0f}" for name in (*_PERCENTILES, "max")))
+    return table
