@@ -3,6 +3,8 @@
 import ast
 import copy
 import importlib
+import importlib.util
+import io
 import os
 import signal
 import subprocess
@@ -17,12 +19,14 @@ import gymnasium
 import numba
 import numpy as np
 import pytest
+from rich.console import Console
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
 from elastic_env.dynamics import walk_kernels as kernels
 from elastic_env.runtime import metrics, worlds
+from train.runs.progress import say_what_is_compiled
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
@@ -123,6 +127,52 @@ def test_a_function_of_the_users_can_call_one_of_ours(tmp_path: Path) -> None:
     path = tmp_path / "users.py"
     path.write_text(USERS)
     subprocess.run([sys.executable, str(path)], check=True, timeout=60)
+
+
+KEPT = """
+from elastic_env.core.compiled import compiled, within_compiled
+
+@within_compiled
+def twice(value):
+    return 2.0 * value
+
+@compiled
+def four_times(value):
+    return twice(twice(value))
+
+@compiled
+def eight_times(value):
+    return four_times(value) * 2.0
+"""
+
+
+def test_a_command_says_once_that_functions_of_ours_are_compiled(tmp_path: Path) -> None:
+    """Catches a wait that nobody explains, a line for every function, and one where the code is loaded."""
+    path, said = tmp_path / "kept.py", []
+    path.write_text(KEPT)
+    for _ in range(2):
+        spec = importlib.util.spec_from_file_location("kept", path)
+        assert spec is not None
+        assert spec.loader is not None
+        kept = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(kept)
+        console = Console(file=io.StringIO())
+        with say_what_is_compiled(console):
+            assert numba.njit(lambda value: value + 1.0)(1.5) == 2.5  # of the user's
+            said.append(console.file.getvalue())  # type: ignore[attr-defined]
+            assert kept.eight_times(1.5) == 12.0
+            assert kept.four_times(1.5) == 6.0
+        kept.four_times(np.float32(1.5))  # compiled, and out of the command
+        said.append(console.file.getvalue())  # type: ignore[attr-defined]
+    line = "compiling, once after an installation or an update: the first use takes some seconds longer\n"
+    assert said == ["", line, "", ""]
+
+
+def test_a_library_says_nothing_of_what_it_compiles() -> None:
+    """Catches output in programs of others."""
+    code = "from elastic_env.core.compiled import compiled; assert compiled(lambda value: 2.0 * value)(1.5) == 3.0"
+    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    assert (ran.stdout, ran.stderr) == (b"", b"")
 
 
 def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:

@@ -4,27 +4,56 @@ Numba compiles them when they are first called with arrays of a kind. It keeps t
 user's cache folder, by the file of the function that was called. So a kernel stands in one file with all that it calls,
 and takes sizes from types, not from constants of other files; a test sees to that. Sums run in the order that is
 written and no operation is fused with another. So a row's result does not depend on how many rows there are.
+
+The logger `elastic_env.core.compiled` says at level INFO that a function of ours is compiled, and nothing where it is
+loaded. So a program can say why its first use takes long.
 """
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+from numba.core import event as events
 from numba.extending import register_jitable
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+
+_LOG = logging.getLogger(__name__)
+_KEPT = "compiling, once after an installation or an update: the first use takes some seconds longer"
+_NOT_KEPT = "compiling, for some seconds in every program: there is no folder to keep it that can be written"
+_said_of: dict[Any, str] = {}
+"""What is logged of a function, by its Python code."""
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorate a function of arrays and numbers; its own Python code is the attribute `py_func`."""
     # as in NumPy, what is divided by zero is infinite or nan
     options: dict[str, Any] = {"error_model": "numpy"}
+    _said_of[function] = _KEPT
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder can be written: every program compiles its own
+        _said_of[function] = _NOT_KEPT
         return numba.njit(**options)(function)
+
+
+class _Compilations(events.Listener):
+    """Logs that a function of ours is compiled; Numba tells nothing of one that it loads."""
+
+    def on_start(self, event: events.Event) -> None:
+        """A compilation begins, of whatever function."""
+        said = _said_of.get(getattr((event.data or {}).get("dispatcher"), "py_func", None))
+        if said is not None:
+            _LOG.info(said)
+
+    def on_end(self, event: events.Event) -> None:
+        """It ends."""
+
+
+events.register("numba:compile", _Compilations())
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -19,8 +19,10 @@ from rich.markup import escape
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
+from train.commands.options import CONSOLE
 from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, View
 from train.runs.failures import DEFECT, explained
+from train.runs.progress import say_what_is_compiled
 
 Command = (
     Annotated[Identify, tyro.conf.subcommand("identify")]
@@ -100,7 +102,9 @@ def main(arguments: list[str] | None = None) -> None:
         sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
-            _command(arguments).run()
+            command = _command(arguments)
+            with say_what_is_compiled(CONSOLE):
+                command.run()
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
         except Exception as error:

@@ -1,5 +1,7 @@
 """How far long work is: bars on a terminal, a line now and then in a log."""
 
+import contextlib
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,6 +14,9 @@ _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
 _ANNOUNCED_S, _LONG_S = 3.0, 30.0
 """When the time to go is said, and from how much on [s]."""
+
+
+_COMPILER = logging.getLogger("elastic_env.core.compiled")
 
 
 class Show(Protocol):
@@ -111,3 +116,36 @@ def _lines(console: Console, totals: Mapping[str, int]) -> Callable[..., None]:
         say(sum(done) / sum(totals.values()), note)
 
     return count
+
+
+@contextmanager
+def say_what_is_compiled(console: Console) -> Iterator[None]:
+    """Say in one line that functions are compiled, when the first one is within; nothing where all are loaded.
+
+    Args:
+        console: Where it is said.
+    """
+    handler, level = _FirstRecord(console), _COMPILER.level
+    _COMPILER.addHandler(handler)
+    _COMPILER.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        _COMPILER.removeHandler(handler)
+        _COMPILER.setLevel(level)
+
+
+class _FirstRecord(logging.Handler):
+    """Shows the first record and no other."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.INFO)
+        self._console, self._is_said = console, False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler`."""
+        if self._is_said:
+            return
+        self._is_said = True
+        with contextlib.suppress(OSError):  # nobody reads: no reason to end what is compiled
+            self._console.print(record.getMessage(), highlight=False, soft_wrap=True)
