@@ -1,6 +1,7 @@
 """`elastic speed --real-time`: counts that fit the clock, and percentiles of what was timed."""
 
 import json
+import os
 import time
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from train.commands.cli import main
 from train.speed.real_time import summary
 
 SLOW = """
+import os
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +25,7 @@ class Slow:
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         assert (state is None) == bool(episode_start)
+        Path("scheduled").write_text(str(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK))
         time.sleep(0.006)  # one and a half control periods
         return np.zeros(self._env.action_space.shape, dtype=np.float32), 1
 """
@@ -54,7 +58,10 @@ def test_a_policy_plays_against_the_clock(env: str, policy: str, capsys: pytest.
 
 
 def test_a_policy_that_takes_longer_than_a_period_is_late_in_every_cycle() -> None:
-    """Catches lateness by the time in the policy alone, which does not add up, and cycles that wait for the clock."""
+    """Catches lateness by the time in the policy alone, which does not add up, and cycles that wait for the clock.
+
+    And a loop that is said to have real-time scheduling and has not, or keeps it.
+    """
     Path("slow.py").write_text(SLOW)
     command = ["speed", "--real-time", "--env", "testbed", "--policy", "slow.py:Slow"]
     main([*command, "--seconds", "0.2", "--output", "result"])
@@ -62,12 +69,14 @@ def test_a_policy_that_takes_longer_than_a_period_is_late_in_every_cycle() -> No
     assert (found["cycles"], found["late_share"]) == (50, 1.0)
     assert found["policy_median_us"] >= 6000.0
     assert found["latency_max_us"] >= 50 * 6000.0 - 49 * 4000.0  # the last one, behind by half a period of each
+    assert found["is_real_time"] == (Path("scheduled").read_text() == str(os.SCHED_FIFO))
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
 
 
 def test_late_cycles_and_percentiles_are_those_of_the_samples() -> None:
     """Catches a cycle at the very end of its period that counts as late, and percentiles in another unit."""
     latency_s = 1e-6 * np.arange(1.0, 1002.0)
-    found = summary("testbed", "input", 1000e-6, latency_s, 0.5 * latency_s)
+    found = summary("testbed", "input", 1000e-6, latency_s, 0.5 * latency_s, is_real_time=False)
     assert (found.cycles, found.late) == (1001, 1)
     figures = found.latency_median_us, found.latency_p99_us, found.latency_p999_us, found.latency_max_us
     assert figures == pytest.approx((501.0, 991.0, 1000.0, 1001.0))

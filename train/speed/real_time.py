@@ -14,6 +14,7 @@ from rich.table import Table
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
+from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, prefer_realtime
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import blamed, make_policy
@@ -41,7 +42,8 @@ class RealTimeResult:
     Attributes:
         env: Environment.
         policy: What was timed.
-        period_us: Control period.
+        is_real_time: Whether the system granted real-time scheduling.
+        period_us: Control period [µs].
         cycles: Commands.
         late: Those that were not ready when the next one was due.
         late_share: Their share, from 0 to 1.
@@ -57,6 +59,7 @@ class RealTimeResult:
 
     env: str
     policy: str
+    is_real_time: bool
     period_us: float
     cycles: int
     late: int
@@ -74,6 +77,8 @@ class RealTimeResult:
 def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
     """Record what the policy observes in an episode, then call it with that once in every control period.
 
+    The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells whether it has it.
+
     The episode begins again, with a policy that remembers nothing, where it is shorter than what is to be played.
 
     Raises:
@@ -90,10 +95,14 @@ def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
         cycles = max(round(config.seconds / period_s), 1)
         with blamed(condition):
             observations = _recorded(env, policy, cycles)
-            latency_s, policy_s = _timed(policy, observations, cycles, period_s)
+            is_real_time = prefer_realtime(Priority.LOOP)
+            try:
+                latency_s, policy_s = _timed(policy, observations, cycles, period_s)
+            finally:
+                give_up_realtime()
     finally:
         env.close()
-    return summary(config.env, name, period_s, latency_s, policy_s)
+    return summary(config.env, name, period_s, latency_s, policy_s, is_real_time=is_real_time)
 
 
 def _recorded(env: Any, policy: Any, most: int) -> list[Any]:
@@ -125,7 +134,9 @@ def _timed(policy: Any, observations: list[Any], cycles: int, period_s: float) -
     return latency_s, policy_s
 
 
-def summary(env: str, policy: str, period_s: float, latency_s: Array, policy_s: Array) -> RealTimeResult:
+def summary(
+    env: str, policy: str, period_s: float, latency_s: Array, policy_s: Array, *, is_real_time: bool
+) -> RealTimeResult:
     """Share of late cycles, and percentiles.
 
     Args:
@@ -134,6 +145,7 @@ def summary(env: str, policy: str, period_s: float, latency_s: Array, policy_s: 
         period_s: Control period [s].
         latency_s: Time from when a cycle was due until its command was ready, (cycles,) [s].
         policy_s: Time in the policy, (cycles,) [s].
+        is_real_time: Whether the system granted real-time scheduling.
     """
     late = int(np.count_nonzero(latency_s > period_s))
     figures = {
@@ -142,8 +154,8 @@ def summary(env: str, policy: str, period_s: float, latency_s: Array, policy_s: 
         for name, percentile in (*_PERCENTILES.items(), ("max", 100.0))
     }
     return RealTimeResult(
-        env=env, policy=policy, period_us=1e6 * period_s, cycles=len(latency_s), late=late,
-        late_share=late / len(latency_s), **figures,
+        env=env, policy=policy, is_real_time=is_real_time, period_us=1e6 * period_s, cycles=len(latency_s),
+        late=late, late_share=late / len(latency_s), **figures,
     )  # fmt: skip
 
 
@@ -170,6 +182,8 @@ def measure_real_time(config: RealTimeConfig, console: Console, output: Path | N
         path.write_text(json.dumps(asdict(result), indent=2) + "\n")
     console.print(_table(result))
     console.print(f"late: {result.late} of {result.cycles} cycles, {100.0 * result.late_share:.3f} %", highlight=False)
+    if not result.is_real_time:
+        console.print("without real-time scheduling, to which this user has no right", highlight=False)
     return path
 
 
