@@ -36,7 +36,8 @@ from train.report.leaderboard import (
     three_digits,
     write_leaderboard,
 )
-from train.report.pages import marks, page_with, pages
+from train.report.learned_pages import MAPS
+from train.report.pages import TABLES, marks, page_with, pages
 from train.report.pages import Results as PageResults
 from train.report.pages import main as write_pages
 from train.runs.folders import run_folder
