@@ -70,9 +70,9 @@ class ModelPicture(ABC):
         """See `Picture`."""
         caption = self._update(signals, world)
         if self._renderer is None:
-            self._renderer = _renderer(self._model)
+            self._renderer = renderer(self._model)
         self._renderer.update_scene(self._data, camera=CAMERA)
-        return _with_text(self._renderer.render(), caption, self._legend)
+        return with_text(self._renderer.render(), caption, self._legend)
 
     def show(self, signals: Signals) -> None:
         """See `Picture`."""
@@ -126,14 +126,19 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
     return viewer
 
 
-def _renderer(model: mujoco.MjModel) -> Any:
+def renderer(model: mujoco.MjModel) -> Any:
+    """A renderer of images in the size that the model names.
+
+    Raises:
+        ElasticError: The machine cannot draw.
+    """
     try:
         return mujoco.Renderer(model, model.vis.global_.offheight, model.vis.global_.offwidth)
     except Exception as error:  # MuJoCo's OpenGL backends raise errors of many types
         raise ElasticError(f"the renderer could not start ({error}); {CURE}") from error
 
 
-def _with_text(image: Image, lines: list[str], legend: Legend) -> Image:
+def with_text(image: Image, lines: list[str], legend: Legend = ()) -> Image:
     """The image with its caption above and its legend below."""
     import PIL.Image  # Pillow comes with Gymnasium's MuJoCo extra
     import PIL.ImageDraw

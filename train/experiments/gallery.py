@@ -7,7 +7,6 @@ Everything is at rest. A servo holds its angle; the joint behind it gives way un
 
 import csv
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -22,7 +21,8 @@ from baselines import PositionCompensator  # noqa: E402
 from elastic_env.core.signals import Array  # noqa: E402
 from elastic_env.dynamics.tree.torque import TreeTorque  # noqa: E402
 from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
-from elastic_env.rendering.picture import Image, set_stage  # noqa: E402
+from elastic_env.rendering.picture import Image  # noqa: E402
+from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402
 from elastic_env.robots.gallery import (  # noqa: E402
     GALLERY,
@@ -37,8 +37,6 @@ _SOFT = 0.7
 """True stiffness over the assumed one in the scenario `soft`."""
 _SEED = 7
 _PIXELS, _COLOURS = 340, 64
-_ENLARGED = 8.0
-_REFERENCE, _REFERENCE_RGBA, _LINK_RGBA = "reference_", (0.3, 0.7, 0.45, 0.3), (1.0, 0.72, 0.42, 1.0)
 
 
 @dataclass(frozen=True)
@@ -143,44 +141,18 @@ def picture(name: str) -> Image:
     """Home pose without and with compensation, side by side; deviations from the translucent reference are enlarged."""
     robot = AtRest(name)
     home = home_pose(name, robot.hinges)
-    spec = _display(name, _LINK_RGBA)
-    set_stage(spec, _PIXELS, _PIXELS)
-    spec.visual.headlight.diffuse = [0.45] * 3
-    spec.attach(_display(name, _REFERENCE_RGBA), prefix=_REFERENCE, frame=spec.worldbody.add_frame())
-    model = spec.compile()
-    data, views = mujoco.MjData(model), []
-    with mujoco.Renderer(model, _PIXELS, _PIXELS) as renderer:
-        for theta in (home, robot.commands(home)):
-            drawn = home + _ENLARGED * (robot.links(theta) - home)
-            for hinge, angle, reference in zip(robot.hinges, drawn, home, strict=True):
-                data.joint(hinge).qpos, data.joint(_REFERENCE + hinge).qpos = angle, reference
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera=_camera(model, data))
-            views.append(renderer.render().copy())
-    return np.concatenate(views, axis=1)
+    links = np.array([robot.links(theta) for theta in (home, robot.commands(home))])
+    return SagViews(_display(name), robot.hinges, _PIXELS).drawn(np.array([home, home]), links)
 
 
-def _display(name: str, rgba: Sequence[float]) -> mujoco.MjSpec:
-    """A robot to look at, in one colour."""
+def _display(name: str) -> mujoco.MjSpec:
+    """A robot to look at."""
     spec = gallery_robot(name, shapes=True)
     for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         spec.delete(geom)
     if not any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in spec.geoms) and name != "pusher":
         add_simple_bodies(spec)
-    for geom in spec.geoms:
-        geom.rgba, geom.material = rgba, ""
     return spec
-
-
-def _camera(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.MjvCamera:
-    """A view from the side that holds the whole robot."""
-    radius = model.geom_rbound[:, None]
-    low, high = (data.geom_xpos - radius).min(axis=0), (data.geom_xpos + radius).max(axis=0)
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = (low + high) / 2.0
-    camera.distance = 1.15 * float(np.linalg.norm(high - low))
-    camera.azimuth, camera.elevation = 125.0, -15.0
-    return camera
 
 
 def write(checkout: Path) -> None:
