@@ -20,7 +20,7 @@ from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
 from train.commands.options import CONSOLE
-from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, View
+from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, Robot, View
 from train.runs.failures import DEFECT, explained
 from train.runs.progress import say_what_is_compiled
 
@@ -35,6 +35,7 @@ Command = (
     | Annotated[Speed, tyro.conf.subcommand("speed")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Robot, tyro.conf.subcommand("robot")]
     | Annotated[Hardware, tyro.conf.subcommand("hardware")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )

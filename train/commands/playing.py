@@ -1,4 +1,4 @@
-"""Commands that play policies: identify, evaluate, compare, play, view, demo."""
+"""Commands that play policies: identify, evaluate, compare, play, robot, view, demo."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -231,6 +231,55 @@ class Play:
         from train.experiments.play import play
 
         play(_watched(self), CONSOLE, self.video, self.max_s)
+
+
+@dataclass
+class Robot:
+    """Try a robot of your own: make its joints elastic, play it with and without compensation, and say what it gains.
+
+    Plays static poses and a motion with the policies uncompensated, input and dynamic, in the scenario nominal: with
+    friction and encoders as the joints file has them. Prints the error of the end effector [mm], and how much of it
+    comes from each joint. The folder has robot.yaml (for --env of the other commands), joints.yaml, picture.png,
+    end_effector.csv, joints.csv, and a comparison with report.html.
+
+    Example: elastic robot arm.urdf --stiffness joints.yaml --end-effector tool0
+
+    Example, one K for all hinges: elastic robot arm.xml --stiffness 1000
+
+    Example, an arm of the gallery (pip install 'elastic-env[robots]'): elastic robot panda
+    """
+
+    model: Annotated[str, tyro.conf.Positional]
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, ROBOT.yaml (a file of a robot, see
+    docs/robots.md), or a name of the gallery, such as panda, ur5, xarm7, so101."""
+    stiffness: str | None = None
+    """YAML file of the elastic joints, or one K of all hinges [N·m/rad]. Has no default, as K is a property of your
+    robot; elastic identify --robot finds it. K of the gallery is assumed."""
+    end_effector: str | None = None
+    """Site or body that is to be placed; default that of the robot's file or of the gallery, or the outermost body."""
+    motion: str = "{kind: moves, positions: 4}"
+    """Motion beside the static poses: moves, line, circle, sine, multisine, or a mapping of kind and parameters."""
+    seed: int = 0
+    """Seed of the episodes."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/robot, numbered if taken."""
+    video: bool = False
+    """Film the motion, uncompensated and with input. Off by default, as drawing can take longer than all the rest."""
+
+    def run(self) -> None:
+        """Play, write, print."""
+        from train.experiments.robot import RobotTrial, try_robot
+
+        stiffness: Any = None if self.stiffness is None else stiffness_option(self.stiffness)
+        with options_named():
+            trial = RobotTrial(
+                model=self.model, stiffness=stiffness, end_effector=self.end_effector,
+                motion=motion("robot", self.motion), seed=self.seed,
+            )  # fmt: skip
+        result = try_robot(trial, CONSOLE, self.output, self.video)
+        CONSOLE.print(f"Results in {result.folder}:", soft_wrap=True)
+        for path in result.files:
+            CONSOLE.print(f"  {path}", soft_wrap=True)
 
 
 @dataclass

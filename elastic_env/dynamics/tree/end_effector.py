@@ -65,6 +65,20 @@ class EndEffector:
         half = np.linalg.norm(R_found - R_wanted, axis=(-2, -1)) / math.sqrt(8.0)
         return np.linalg.norm(found - wanted, axis=-1), 2.0 * np.arcsin(np.minimum(half, 1.0))
 
+    def parts(self, q_ref: Array, q: Array) -> Array:
+        r"""Where the error of the position comes from: what the deviation of each joint alone moves, to first order.
+
+        .. math:: p(q) - p(q_{ref}) \approx \sum_j J_j(q_{ref}) (q_j - q_{ref,j})
+
+        Args:
+            q_ref: Angles that are wanted, (..., n) [rad].
+            q: Angles that are, (..., n) [rad].
+
+        Returns:
+            A term of the sum per joint, in the world's axes, (..., 3, n) [m].
+        """
+        return self.jacobian(q_ref)[0] * (q - q_ref)[..., None, :]
+
     def _walked(self, q: Array) -> tuple[Array, ...]:
         """Position and orientation of the end effector; axis and anchor of each hinge before it, a row per pose."""
         rows = np.ascontiguousarray(q, dtype=np.float64).reshape(-1, self._n)

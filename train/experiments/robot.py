@@ -1,0 +1,380 @@
+"""`elastic robot`: a robot from its model, made elastic, played with and without compensation, in one call.
+
+Its folder holds the robot's file, a comparison with report, a picture, and the two tables that it prints.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import Field
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from baselines import PositionCompensator
+from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read_mapping
+from elastic_env.core.errors import ConfigurationError, ElasticError, shown
+from elastic_env.core.signals import Array
+from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.motion.arm_references import Poses
+from elastic_env.rendering.picture import Image, with_text
+from elastic_env.rendering.sag import ENLARGED, SagViews
+from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
+from elastic_env.robots.robot.environment import RobotConfig, configure_robot
+from elastic_env.runtime.joint_task import JointPlant
+from train.evaluate.conditions import Condition, GivenReference, PolicySpec
+from train.evaluate.evaluate import Evaluation
+from train.evaluate.robot_file import ENDINGS, read_robot_file
+from train.experiments.compare import CompareConfig, compare
+from train.experiments.play import play
+from train.figures import plots
+from train.report import require_jinja2, require_plotly
+from train.runs.escaping import write_records
+from train.runs.folders import run_folder
+
+SCENARIO = "nominal"
+"""The robot as its joints are described, friction and encoders included; `ideal` would leave these out."""
+POLICIES = ("uncompensated", "input", "dynamic")
+_TIP = "tip"
+_PIXELS, _POSES_SHOWN = 420, 2
+
+
+class RobotTrial(Model):
+    """What `elastic robot` does."""
+
+    model: Locator
+    """File of MJCF or URDF, a file of a robot (.yaml), or a name of the gallery."""
+    stiffness: Locator | float | None = None
+    """File of the elastic joints, or one K of all hinges [N·m/rad]."""
+    end_effector: Locator | None = None
+    """Site or body that is placed."""
+    poses: Poses = Poses(positions=4)
+    """Static poses; fewer than an environment plays, for a result within a minute."""
+    motion: GivenReference = Field(default={"kind": "moves", "positions": 4})
+    """Motion that is played beside the static poses."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the episodes")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """How far the end effector is from where it should be, as it was played.
+
+    Attributes:
+        motion: Reference that was played.
+        policy: Policy that commanded.
+        error_rms_m: Distance, rms over what is scored [m]; nan where the episode failed.
+        error_peak_m: Its largest [m].
+    """
+
+    motion: str
+    policy: str
+    error_rms_m: float
+    error_peak_m: float
+
+
+@dataclass(frozen=True)
+class JointShare:
+    """What a joint adds to the error of the end effector at rest, uncompensated and without friction.
+
+    Attributes:
+        joint: Its name.
+        stiffness_Nm_per_rad: K of its transmission.
+        gravity_torque_rms_Nm: Torque that it carries, rms over the poses.
+        deflection_rms_rad: How far its link is from the command, rms over the poses; a servo that gives way adds to it.
+        end_effector_rms_m: How far that alone moves the end effector, rms over the poses.
+        share: Part of the error that it explains; the joints together make 1, and one that helps another is negative.
+        friction_leaves_m: How far friction F can hold the end effector off by F/K, rms over the poses.
+    """
+
+    joint: str
+    stiffness_Nm_per_rad: float
+    gravity_torque_rms_Nm: float
+    deflection_rms_rad: float
+    end_effector_rms_m: float
+    share: float
+    friction_leaves_m: float
+
+
+@dataclass(frozen=True)
+class RobotResult:
+    """What came out, and its files."""
+
+    folder: Path
+    placed: list[Placed]
+    shares: list[JointShare]
+    files: list[Path]
+
+
+def try_robot(trial: RobotTrial, console: Console, output: Path | None = None, video: bool = False) -> RobotResult:
+    """Make a robot elastic, play it with every policy, write its folder, and print its tables.
+
+    Args:
+        trial: The robot and its motion.
+        console: Where progress and tables go.
+        output: Folder for the results; default runs/robot, numbered if taken.
+        video: Whether the motion is filmed, without and with `input`.
+
+    Raises:
+        ConfigurationError: The model, its joints or the motion cannot be used; found before a folder is made.
+        ResultsExistError: The output folder holds results.
+        MissingExtraError: A package for reports or videos is missing.
+    """
+    plots.require_matplotlib()
+    require_plotly()
+    require_jinja2()
+    arguments = robot_arguments(trial)
+    moving, config = (
+        configure_robot(**arguments, reference=reference, scenario=SCENARIO)
+        for reference in (trial.motion, trial.poses)
+    )
+    moving.robot.plant(moving)  # refuses what its servos cannot follow
+    plant = config.robot.plant(config)
+    if trial.stiffness is None and trial.model in GALLERY:
+        console.print(f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness")
+    with run_folder("robot", trial.model_dump(mode="json"), trial.seed, output) as folder:
+        file = write_robot(arguments, folder)
+        comparison = compare(_comparison(trial, file), console, folder / "comparison")
+        placed, shares = [_placed(one) for one in comparison.evaluations], joint_shares(plant)
+        files = [
+            file,
+            comparison.folder / "report.html",
+            write_records([asdict(one) for one in placed], folder / "end_effector.csv"),
+            write_records([asdict(one) for one in shares], folder / "joints.csv"),
+            *_pictures(config, plant, folder, console),
+            *(_films(trial, file, folder, console) if video else []),
+        ]
+    for table in (_placed_table(placed), _shares_table(shares)):
+        console.print(table)
+    return RobotResult(folder, placed, shares, files)
+
+
+def robot_arguments(trial: RobotTrial) -> dict[str, Any]:
+    """Arguments of `elastic_env/Robot-v0`, without reference and scenario.
+
+    Raises:
+        ConfigurationError: There is no such file or robot, or the stiffness is missing.
+    """
+    arguments = _of_model(trial.model)
+    if trial.stiffness is not None:
+        arguments["joints"] = _given_joints(trial.stiffness)
+    if trial.end_effector is not None:
+        arguments["end_effector"] = trial.end_effector
+    return arguments
+
+
+def _of_model(name: str) -> dict[str, Any]:
+    if name in GALLERY:
+        return _of_gallery(name)
+    if name.endswith(ENDINGS) and Path(name).is_file():
+        return read_robot_file(name)
+    if not Path(name).is_file():
+        raise ConfigurationError(
+            f"no model at {name}; give a file of MJCF (.xml) or URDF (.urdf), a file of a robot (.yaml), or a robot of "
+            f"the gallery: {', '.join(GALLERY)}"
+        )
+    return {"model": str(Path(name).resolve()), "joints": {}}
+
+
+def _of_gallery(name: str) -> dict[str, Any]:
+    """A robot of the gallery with its assumed joints. Its own file, if nothing has to be changed in it."""
+    known = GALLERY[name]
+    file, end_effector = gallery_file(name), known.end_effector
+    model = str(file)
+    if file.suffix != ".urdf" or any(known.tip):
+        spec, end_effector = gallery_robot(name), _TIP
+        spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
+        spec.compile()
+        model = spec.to_xml()
+    joints = {name: _settings(joint) for name, joint in gallery_joints(name).items()}
+    return {"model": model, "joints": joints, "end_effector": end_effector, "home": dict(known.home)}
+
+
+def _settings(joint: ElasticJoint) -> dict[str, Any]:
+    """An elastic joint as a file has it."""
+    assert joint.servo is not None
+    names = ("stiffness", "damping", "rotor_inertia")
+    gains = ("position_gain", "velocity_gain", "integral_gain", "torque_limit", "speed_limit")
+    return {
+        **{name: getattr(joint, name) for name in names},
+        "servo": {name: getattr(joint.servo, name) for name in gains},
+    }
+
+
+def _given_joints(stiffness: str | float) -> dict[str, Any]:
+    """Elastic joints of a file, or of one K."""
+    if isinstance(stiffness, str):
+        return dict(read_mapping(Path(stiffness)))
+    if not stiffness > 0.0:
+        raise ConfigurationError(f"stiffness must be > 0 N·m/rad or a file of joints, got {shown(stiffness)}")
+    return {"*": stiffness}
+
+
+def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
+    """Write a robot's file and its joints into a folder; the model stays where it is, unless it is text.
+
+    Args:
+        arguments: Of `elastic_env/Robot-v0`.
+        folder: Where it goes.
+
+    Returns:
+        The robot's file, for `--env`.
+    """
+    written, model, joints = dict(arguments), arguments["model"], arguments["joints"]
+    if model.lstrip().startswith("<"):
+        (folder / "model.xml").write_text(model, encoding="utf-8")
+        written["model"] = "model.xml"
+    else:
+        written["model"] = str(Path(model).resolve())
+    mapping = read_mapping(Path(joints)) if isinstance(joints, str) else joints
+    written["joints"] = "joints.yaml"
+    for name, content in (("joints.yaml", mapping), ("robot.yaml", written)):
+        (folder / name).write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
+    return folder / "robot.yaml"
+
+
+def _comparison(trial: RobotTrial, file: Path) -> CompareConfig:
+    references = [trial.poses.model_dump(mode="json"), trial.motion]
+    return CompareConfig(
+        name="robot", env=str(file), references=references, scenarios=[SCENARIO],
+        policies=[PolicySpec(name=name) for name in POLICIES], seed=trial.seed,
+    )  # fmt: skip
+
+
+def _placed(evaluation: Evaluation) -> Placed:
+    def only(metric: str) -> float:
+        values = evaluation.values(metric)
+        return float(values[0]) if len(values) else float("nan")
+
+    return Placed(
+        evaluation.condition.reference_name, evaluation.condition.policy.title,
+        only("end_effector_error_rms_m"), only("end_effector_error_peak_m"),
+    )  # fmt: skip
+
+
+def rest_poses(plant: JointPlant) -> Array:
+    """The static poses of a reference, (poses, n) [rad]."""
+    plan = plant.motion.plan(np.random.default_rng(0), plant.true.control_period_s)
+    return plan.q[np.unique(plan.rest, return_index=True)[1][int(plan.rest.min() < 0) :]]
+
+
+def joint_shares(plant: JointPlant) -> list[JointShare]:
+    r"""Where the error of the end effector at rest comes from, in closed form.
+
+    Nothing is played: a link rests where spring and weight balance, K(θ − q) = τ_g(q), with θ = q_ref. With column
+    J_j of the end effector's Jacobian the error is, to first order, the sum over the joints
+
+    .. math:: e = \sum_j J_j(q_{ref}) (q_j - q_{ref,j}), \quad s_j = \frac{\sum e \cdot e_j}{\sum e \cdot e}
+
+    with e_j the term of joint j, and sums over the poses. The shares s_j add up to 1.
+
+    Args:
+        plant: A robot with an end effector, and static poses as its reference.
+    """
+    tool = plant.end_effector
+    assert tool is not None
+    q_ref = rest_poses(plant)
+    q = plant.rest_angle(q_ref)
+    parts, torque = tool.parts(q_ref, q), plant.static_torque(q)
+    error = parts.sum(axis=-1)
+    shares = np.einsum("pi,pij->j", error, parts) / max(float(np.sum(error**2)), np.finfo(np.float64).tiny)
+    lever = np.linalg.norm(tool.jacobian(q_ref)[0], axis=1)
+    friction = lever * plant.true.coulomb_friction / plant.true.rest_stiffness("tendon")
+    columns = zip(
+        plant.joint_names, plant.true.stiffness, _rms(torque), _rms(q - q_ref),
+        _rms(np.linalg.norm(parts, axis=1)), shares, _rms(friction), strict=True,
+    )  # fmt: skip
+    return [JointShare(name, *map(float, values)) for name, *values in columns]
+
+
+def _rms(values: Array) -> Array:
+    """Over the poses."""
+    return np.sqrt(np.mean(values**2, axis=0))
+
+
+def _pictures(config: RobotConfig, plant: JointPlant, folder: Path, console: Console) -> list[Path]:
+    """The picture, or none on a machine that cannot draw."""
+    try:
+        image = picture(config, plant)
+    except ElasticError as error:
+        console.print(escape(f"no picture: {error}"), soft_wrap=True)
+        return []
+    import PIL.Image
+
+    path = folder / "picture.png"
+    PIL.Image.fromarray(image).save(path, optimize=True)
+    return [path]
+
+
+def picture(config: RobotConfig, plant: JointPlant) -> Image:
+    """The poses with the largest sag, in rows: left without, right with the command of `PositionCompensator`.
+
+    It is in closed form, as `joint_shares`. Deviations from the translucent reference are enlarged.
+
+    Raises:
+        ElasticError: The machine cannot draw.
+    """
+    tool = plant.end_effector
+    assert tool is not None
+    known = plant.assumed
+    in_series = known.rest_stiffness("tendon").tolist()  # of spring and servo, as the command has to lead both
+    compensator = PositionCompensator(known.rigid, in_series, joints=known.joint_names)
+    q_ref = rest_poses(plant)
+    order = np.argsort(-tool.errors(q_ref, plant.rest_angle(q_ref))[0])[:_POSES_SHOWN]
+    views, rows = SagViews(config.robot.rigid(), plant.joint_names, _PIXELS), []
+    for wanted in q_ref[order]:
+        twice = np.array([wanted, wanted])
+        links = plant.rest_angle(np.array([wanted, compensator.command(wanted)]))
+        errors = 1e3 * tool.errors(twice, links)[0]
+        caption = [
+            f"end effector off by {errors[0]:.2f} mm without, {errors[1]:.3f} mm with compensation",
+            f"at rest without friction; deviations from the translucent reference drawn x {ENLARGED:g}",
+        ]
+        rows.append(with_text(views.drawn(twice, links), caption))
+    return np.concatenate(rows)
+
+
+def _films(trial: RobotTrial, file: Path, folder: Path, console: Console) -> list[Path]:
+    """The motion without and with `input`."""
+    films = []
+    for policy in POLICIES[:2]:
+        condition = Condition(
+            env=str(file), policy=PolicySpec(name=policy), scenario=SCENARIO, reference=trial.motion, seed=trial.seed
+        )
+        films.append(folder / f"{policy}.mp4")
+        play(condition, console, films[-1])
+    return films
+
+
+def _placed_table(placed: Sequence[Placed]) -> Table:
+    table = Table(title="end effector, rms error \\[mm]", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("motion")
+    for policy in POLICIES:
+        table.add_column(policy, justify="right")
+    table.add_column("left by the best", justify="right")
+    for motion in dict.fromkeys(one.motion for one in placed):
+        errors = [1e3 * one.error_rms_m for one in placed if one.motion == motion]
+        left = f"{100.0 * min(errors[1:]) / errors[0]:.1f} %" if errors[0] > 0.0 else "-"
+        table.add_row(escape(motion), *(f"{error:.3f}" for error in errors), left)
+    return table
+
+
+def _shares_table(shares: Sequence[JointShare]) -> Table:
+    caption = "closed form over the static poses, uncompensated; F/K is what friction can leave"
+    table = Table(
+        title="where the error at rest comes from", caption=caption, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    table.add_column("joint")
+    for name in ("K\nNm/rad", "torque\nNm", "deflection\nmrad", "alone\nmm", "share\n%", "F/K\nmm"):
+        table.add_column(name, justify="right", vertical="bottom")
+    for one in shares:
+        table.add_row(
+            escape(one.joint), f"{one.stiffness_Nm_per_rad:.4g}", f"{one.gravity_torque_rms_Nm:.2f}",
+            f"{1e3 * one.deflection_rms_rad:.2f}", f"{1e3 * one.end_effector_rms_m:.2f}",
+            f"{100.0 * one.share:.1f}", f"{1e3 * one.friction_leaves_m:.2f}",
+        )  # fmt: skip
+    return table
