@@ -77,8 +77,12 @@ def test_the_folder_goes_on_with_other_commands(tried: tuple[Path, str]) -> None
     assert (folder / "comparison" / "report.html").is_file()
     again = configure_robot(**environment(str(folder / "robot.yaml")).arguments("poses"))
     given = configure_robot(str(EXAMPLE), str(JOINTS), end_effector="tool")
-    assert again.joints == given.joints
-    assert again.robot.end_effector == given.robot.end_effector
+    tried_again = configure_robot(**robot_arguments(RobotTrial(model=str(folder / "robot.yaml"))))
+    for config in (again, tried_again):
+        assert config.joints == given.joints
+        assert config.robot.end_effector == given.robot.end_effector
+    softer = configure_robot(**robot_arguments(RobotTrial(model=str(folder / "robot.yaml"), stiffness=300.0)))
+    assert {joint.stiffness for joint in softer.joints.values()} == {300.0}
 
 
 def at_rest(model: mujoco.MjModel, stiffness: Array, theta: Array) -> Array:

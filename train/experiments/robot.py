@@ -186,7 +186,7 @@ def _of_gallery(name: str) -> dict[str, Any]:
     file, end_effector = gallery_file(name), known.end_effector
     model = str(file)
     if file.suffix != ".urdf" or any(known.tip):
-        spec, end_effector = gallery_robot(name), _TIP
+        spec, end_effector = gallery_robot(name, shapes=True), _TIP
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
@@ -358,8 +358,10 @@ def _placed_table(placed: Sequence[Placed]) -> Table:
     table.add_column("left by the best", justify="right")
     for motion in dict.fromkeys(one.motion for one in placed):
         errors = [1e3 * one.error_rms_m for one in placed if one.motion == motion]
-        left = f"{100.0 * min(errors[1:]) / errors[0]:.1f} %" if errors[0] > 0.0 else "-"
-        table.add_row(escape(motion), *(f"{error:.3f}" for error in errors), left)
+        best = min((error for error in errors[1:] if not np.isnan(error)), default=np.nan)
+        left = best / errors[0] if errors[0] > 0.0 else np.nan
+        shown_errors = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
+        table.add_row(escape(motion), *shown_errors, "-" if np.isnan(left) else f"{100.0 * left:.1f} %")
     return table
 
 
