@@ -12,7 +12,7 @@ from train.runs.escaping import markdown_table
 
 _METRICS = {"pelvis_error_rms_rad": ("pelvis error", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm")}
 """Metrics that pages show, with the unit of their tables."""
-MAPS = ("map_stiffness_imu",)
+MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHOWN = ("lower", "higher")
 """Verdicts of a change that chance does not explain."""
