@@ -36,10 +36,10 @@ from train.report.leaderboard import (
     three_digits,
     write_leaderboard,
 )
-from train.report.learned_pages import MAPS
-from train.report.pages import TABLES, marks, page_with, pages
-from train.report.pages import Results as PageResults
-from train.report.pages import main as write_pages
+from train.report.pages.learned import MAPS
+from train.report.pages.write import TABLES, marks, page_with, pages
+from train.report.pages.write import Results as PageResults
+from train.report.pages.write import main as write_pages
 from train.runs.folders import run_folder
 
 ROOT = Path(__file__).parents[1]
@@ -263,15 +263,23 @@ def test_one_changed_number_changes_every_page_that_shows_it() -> None:
     results = PageResults.read(ROOT / "docs" / "results")
     found = [s for s in results.standings if s.training_seeds and s.is_column]
     assert found[0].base is not None
-    base = replace(found[0].base, change=Estimate(-0.123, -0.2, -0.1))
+    base = replace(found[0].base, change=Estimate(-0.985, -0.99, -0.98))
     walks = [{**row, "pelvis_roll_peak_rad": row["pelvis_roll_peak_rad"] and "0.0777"} for row in results.walks]
     gallery = [{**row, "uncompensated_peak_m": "0.0888"} for row in results.gallery]
-    changed = PageResults([replace(s, base=base) if s is found[0] else s for s in results.standings], walks, gallery)
+    standings = [replace(s, base=base) if s is found[0] else s for s in results.standings]
+    learned = [{**row, "base_mean": "0.0666"} for row in results.learned]
+    maps = {name: [replace(m, y_is="another axis") for m in own] for name, own in results.maps.items()}
+    changed = PageResults(standings, walks, gallery, learned, maps)
+    of_standings = ("README.md", "leaderboard.md", "learned.md")
     for page in pages(ROOT):
         text = page.read_text(encoding="utf-8")
         assert ("77.7" in page_with(text, changed)) == (page.name == "README.md")
         assert ("88.8" in page_with(text, changed)) == (page.name == "gallery.md")
-        assert ("−12 %" in page_with(text, changed)) == (page.name != "gallery.md")
+        assert ("[−99, −98]" in page_with(text, changed)) == (
+            page.name in ("README.md", "leaderboard.md", "learned.md")
+        )
+        assert ("66.6" in page_with(text, changed)) == (page.name == "learned.md")
+        assert ("another axis" in page_with(text, changed)) == (page.name == "maps.md")
 
 
 # The configuration.

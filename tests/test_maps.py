@@ -123,7 +123,7 @@ def test_the_maps_that_come_with_the_project_can_be_played(name: str) -> None:
     assert [len(axis.values) for axis in config.map.axes] == [5, 5]
     conditions = config.conditions()
     assert len(conditions) == 25 * (2 + 5)
-    assert {c.policy.title for c in conditions} == {"input_output", "adaptive_posture", "residual"}
+    assert {c.policy.title for c in conditions} == {"input_output", "adaptive_posture", "residual on adaptive_posture"}
 
 
 # Who is best.

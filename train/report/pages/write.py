@@ -7,7 +7,6 @@ writes every part anew. A test fails where a page and the results disagree.
 """
 
 import csv
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,7 +16,7 @@ from elastic_env.core.errors import ConfigurationError
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
-from train.report.learned_pages import MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
+from train.report.pages.learned import MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -188,7 +187,3 @@ def main(arguments: Sequence[str]) -> None:
     for page in found:
         page.write_text(page_with(page.read_text(encoding="utf-8"), results), encoding="utf-8")
     print(f"{len(found)} pages written: {', '.join(str(page.relative_to(root)) for page in found)}")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
