@@ -24,6 +24,7 @@ from train.figures.figures import draw_maps
 from train.figures.map_plots import Square, blended, panels
 from train.report import Results, write_report
 from train.report.changes_tables import write_maps
+from train.report.pages.learned import learned_maps
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -158,6 +159,20 @@ def test_a_cell_compares_learning_with_the_best_without_it_there() -> None:
     assert stiff.learned["learned"].relative.value == 2.0
     assert (loaded.learned["learned"].relative.value, loaded.learned["learned"].falls_more) == (-0.25, True)
     assert loaded.failed == {"base": (0, 2), "best": (1, 2), "learned": (5, 10)}
+
+
+def test_a_page_has_the_map_with_what_is_ahead_and_what_failed() -> None:
+    """Catches a table upside down, a change with the wrong sign, and a cell in which every policy fell."""
+    (found,) = learned_maps(write_maps([grid(FOUR)], Path("map.csv")))
+    assert [line.split(" | ") for line in found.table.splitlines()[2:]] == [
+        ["| **5**", "−25 % ✕5", "- ✕10 |"],
+        ["| **0**", "−50 %", "+200 % |"],
+    ]
+    assert found.sentence.startswith("**Pelvis error.** Ahead in 2 of 4 cells, behind in 1. ")
+    assert found.sentence.endswith("is base in 2 of 4 cells.")
+    Path("none.csv").write_text("policy,verdict\ninput,\n")
+    with pytest.raises(ConfigurationError, match=r"none\.csv compares no residual"):
+        learned_maps(Path("none.csv"))
 
 
 def test_the_truth_wins_no_cell_and_further_sensors_are_no_rival() -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import percent, percent_interval
+from train.evaluate.changes import FEWEST_SEEDS, percent, percent_interval
 from train.evaluate.statistics import Estimate
 from train.runs.escaping import markdown_table
 
@@ -23,17 +23,13 @@ class LearnedMap:
     """The change by a residual against the best policy without learning, over two axes, in one metric.
 
     Attributes:
-        title: Motion and scenario.
         metric: Column of the episodes.
-        residual: Title of the residual.
         x_is, y_is: What the axes are.
         x, y: Their values as they are shown.
         cells: Row of the CSV by (x, y).
     """
 
-    title: str
     metric: str
-    residual: str
     x_is: str
     y_is: str
     x: Sequence[str]
@@ -45,7 +41,7 @@ class LearnedMap:
         """From the rows of one map, metric and residual."""
         first = rows[0]
         return cls(
-            first["map"], first["metric"], first["policy"], first["x_is"], first["y_is"],
+            first["metric"], first["x_is"], first["y_is"],
             list(dict.fromkeys(row["x"] for row in rows)), list(dict.fromkeys(row["y"] for row in rows)),
             {(row["x"], row["y"]): row for row in rows},
         )  # fmt: skip
@@ -61,7 +57,7 @@ class LearnedMap:
     def sentence(self) -> str:
         """In how many cells the residual is ahead and behind, and whom it is compared with."""
         verdicts = [row["verdict"] for row in self.cells.values()]
-        rivals = [row["best_without_learning"] for row in self.cells.values()]
+        rivals = [row["best_without_learning"] or "none" for row in self.cells.values()]
         title, _ = _METRICS[self.metric]
         common = max(dict.fromkeys(rivals), key=rivals.count)
         return (
@@ -80,10 +76,11 @@ def learned_maps(path: Path) -> list[LearnedMap]:
     if not path.is_file():
         raise ConfigurationError(f"{path} is missing; copy it from the run of elastic compare configs/{path.stem}.yaml")
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["verdict"]]
-    if not rows:
+        rows = list(csv.DictReader(file))
+    learned = {row["policy"] for row in rows if row["verdict"]}
+    if not learned:
         raise ConfigurationError(f"{path} compares no residual; a map of learning needs one among its policies")
-    keys = dict.fromkeys((row["map"], row["metric"], row["policy"]) for row in rows)
+    keys = dict.fromkeys((row["map"], row["metric"], row["policy"]) for row in rows if row["policy"] in learned)
     return [LearnedMap.of([row for row in rows if (row["map"], row["metric"], row["policy"]) == key]) for key in keys]
 
 
@@ -106,14 +103,17 @@ def changes_table(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
-    """Mean of the base in milli-units, and the change with its interval and a star where that includes zero."""
-    change = Estimate(*(float(row[name]) for name in ("change", "change_low", "change_high")))
-    star = " *" if float(row["change_low"]) <= 0.0 <= float(row["change_high"]) else ""
-    return f"{1e3 * float(row['base_mean']):.{2 if unit == 'mrad' else 1}f}", f"{percent_interval(change)}{star}"
+    """Mean of the base in mrad or mm, and the change with its interval; a star where chance explains it."""
+    change, low, high = (float(row[name]) for name in ("change", "change_low", "change_high"))
+    star = " *" if low <= 0.0 <= high or int(row["training_seeds"]) < FEWEST_SEEDS else ""
+    return (
+        f"{1e3 * float(row['base_mean']):.{2 if unit == 'mrad' else 1}f}",
+        f"{percent_interval(Estimate(change, low, high))}{star}",
+    )
 
 
 def _change(row: Mapping[str, str]) -> str:
     """Relative change, with a star where chance explains it, and ✕ where a policy failed."""
     star = "" if row["verdict"] in _SHOWN else " *"
     failed = f" ✕{row['failed']}" if row["failed"] not in ("", "0") else ""
-    return f"{percent(float(row['change']))}{star}{failed}" if row["change"] else "-"
+    return f"{percent(float(row['change']))}{star}{failed}" if row["change"] else f"-{failed}"
