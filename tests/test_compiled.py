@@ -33,7 +33,7 @@ KERNELS = (
     "elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels",
     "elastic_env.dynamics.tree.kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.tree.end_effector",
     "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
-    "baselines.estimation.estimation_kernels",
+    "baselines.estimation.estimation_kernels", "baselines.adaptation.adaptation_kernels",
 )  # fmt: skip
 
 

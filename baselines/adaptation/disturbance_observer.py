@@ -110,7 +110,7 @@ class DisturbanceObserver:
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._begin(rows))
         action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
         memory = self._observed(rows, memory)
-        lead = self._ramp.share(memory[:, :1]) * self.disturbance((memory, inner)) / self._model.stiffness
+        lead = self._ramp.after(memory[:, :1]) * self.disturbance((memory, inner)) / self._model.stiffness
         total = np.asarray(action, dtype=np.float64) + lead.reshape(np.shape(action))
         return total.astype(np.float32), (memory, inner)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from baselines.adaptation.adaptation_kernels import count_due, follow
 from baselines.adaptation.estimators import Estimator
 from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.policy import Action, ObservationView, PolicyAround, PolicyWithInputs, taken_up
@@ -73,12 +74,10 @@ class OnlineStiffness(PolicyAround):
     def _adapted(self, rows: Array, memory: Array) -> Array:
         """Memory after a control step: a new target where one is due, and the filtered correction."""
         memory, n = memory.copy(), self._n
-        steps, target, filtered = memory[:, :1], memory[:, 1 : 1 + n], memory[:, 1 + n : 1 + 2 * n]
-        due = np.flatnonzero(steps[:, 0] % self._every == 0)
-        if len(due):
-            kept = memory[:, 1 + 2 * n :]
+        if count_due(memory, self._every) > 0:
+            due = np.flatnonzero(memory[:, 0] % self._every == 0)
+            target, kept = memory[:, 1 : 1 + n], memory[:, 1 + 2 * n :]
             wanted, kept[due] = self._estimator.estimate(rows[due], kept[due])
             target[due] = np.clip(wanted, -self._limit, self._limit)
-        filtered += self._gain * (target - filtered)
-        steps += 1.0
+        follow(memory, n, self._gain)
         return memory

@@ -75,7 +75,7 @@ class Compensated(PolicyWithInputs):
         if correction is not None:
             offset = offset + correction * compensator.deflection(offset, kept)
         steps = memory[:, :1] + 1.0
-        total = (action + self._ramp.share(steps) * offset).astype(np.float32)
+        total = (action + self._ramp.after(steps) * offset).astype(np.float32)
         return total.reshape((*observation.shape[:-1], n)), (np.concatenate((steps, links, kept), axis=1), inner_state)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:

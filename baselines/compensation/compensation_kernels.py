@@ -45,19 +45,19 @@ DRIVE = np.dtype(
 
 
 @compiled
-def planned_loads(observed: Any, contact: Any, is_level: bool, loads: Any) -> None:
+def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
     """Loads under the planned load share.
 
     Args:
         observed: Observations, rows with fields.
         contact: Row of `CONTACT`, (1,).
-        is_level: Whether the pelvis is level, or tilted as the IMU says.
-        loads: To be filled, rows of `elastic_env.dynamics.leg_kernels.loads_type`.
+        level: Loads of a pelvis that is level, to be filled, rows of `elastic_env.dynamics.leg_kernels.loads_type`.
+        tilted: The same of one that is tilted as the IMU says.
     """
     ground = contact[0]
-    for world in range(len(loads)):
-        load, plan = loads[world], observed[world]
-        fill_gravity(plan, ground.gravity, is_level, load)
+    for world in range(len(level)):
+        load, plan = level[world], observed[world]
+        fill_gravity(plan, ground.gravity, True, load)
         load.legs_weigh = ground.legs_weigh
         share = plan.load_share
         for foot in range(2):
@@ -69,11 +69,20 @@ def planned_loads(observed: Any, contact: Any, is_level: bool, loads: Any) -> No
             load.point[foot, 2] = -ground.ankle_height if ground.is_at_zmp else 0.0
             for i in range(3):
                 load.wrench[foot, 0, i] = load.wrench[foot, 1, i] = 0.0
+        tilted[world] = load
+        fill_gravity(plan, ground.gravity, False, tilted[world])
 
 
 @compiled
 def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) -> None:
-    """Loads by the foot wrenches; `gravity` is its acceleration [m/s²], other arguments as in `planned_loads`."""
+    """Loads by the foot wrenches.
+
+    Args:
+        observed: Observations, rows with fields.
+        gravity: Its acceleration [m/s²].
+        is_level: Whether the pelvis is level, or tilted as the IMU says.
+        loads: To be filled, rows of `elastic_env.dynamics.leg_kernels.loads_type`.
+    """
     for world in range(len(loads)):
         load, shown = loads[world], observed[world]
         fill_gravity(shown, gravity, is_level, load)

@@ -6,8 +6,7 @@ compensator says where the link is when the motor encoder shows θ. All work on 
 [Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 """
 
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args
 
 import numpy as np
 
@@ -22,8 +21,7 @@ from elastic_env.runtime.robot_model import RobotModel
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """Desired motion of the links, (..., n) each [rad], [rad/s], [rad/s²]."""
 
     q: Array
@@ -142,13 +140,16 @@ class GravityCompensator:
         self.gravity = self._load = make_gravity(model, method)
         """τ_g of the desired posture and of the measured one."""
         self._source, self._load_source = self.gravity, make_load(model, output, self.gravity)
+        self._loads_alike = self._load_source is self._source
         self._output = output
 
     def at(self, rows: Array) -> "GravityCompensator":
         """See `Compensator`."""
         bound = alike(self)
-        bound.gravity = self._source.at(rows)
-        bound._load = self._load_source.at(rows, level=False)
+        if self._loads_alike:
+            bound.gravity, bound._load = self._source.level_and_tilted(rows)
+        else:
+            bound.gravity, bound._load = self._source.at(rows), self._load_source.at(rows, level=False)
         return bound
 
     def begin(self, motion: Motion) -> Array:

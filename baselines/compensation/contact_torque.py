@@ -114,9 +114,13 @@ class ContactGravity:
             rows: Observations.
             level: Whether the pelvis is level, as commanded, or tilted as the IMU says.
         """
-        loads = self._chains.loads(len(rows))
-        kernels.planned_loads(self._observed.fields(rows), self._contact, level, loads)
-        return LegTorque(self._chains, loads)
+        return self.level_and_tilted(rows)[0 if level else 1]
+
+    def level_and_tilted(self, rows: Array) -> tuple[LegTorque, LegTorque]:
+        """The gravity torques of `at` with a level pelvis, and with one that is tilted as the IMU says."""
+        level, tilted = self._chains.loads(len(rows)), self._chains.loads(len(rows))
+        kernels.planned_loads(self._observed.fields(rows), self._contact, level, tilted)
+        return LegTorque(self._chains, level), LegTorque(self._chains, tilted)
 
 
 class WrenchTorque:

@@ -41,6 +41,10 @@ class FixedGravity:
         """Itself."""
         return self
 
+    def level_and_tilted(self, rows: Array) -> "tuple[FixedGravity, FixedGravity]":  # noqa: ARG002  a walker's
+        """Itself twice: no pelvis tilts."""
+        return self, self
+
 
 class FixedDynamics:
     """Inverse dynamics of a robot on a fixed base."""

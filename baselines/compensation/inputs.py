@@ -8,9 +8,8 @@ Columns per joint are in the order of the robot's joints. Axes: x forward, y to 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,8 +76,7 @@ def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
     return tuple(Signal(f"{name}.{joint}", kind.unit, kind.meaning, mirrored=sign) for joint, sign in named)
 
 
-@dataclass(frozen=True, eq=False)
-class PolicyInputs:
+class PolicyInputs(NamedTuple):
     """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is not used.
 
     A wrapper takes what is its own and passes on the rest. `INPUTS` says what each is. `command` is no field: it is
@@ -93,16 +91,14 @@ class PolicyInputs:
     posture_gain: Array | None = None
     balance_gain: Array | None = None
 
-    @cached_property
+    @property
     def is_empty(self) -> bool:
         """Whether no input is used."""
-        return all(value is None for value in vars(self).values())
+        return self is NO_INPUTS or all(value is None for value in self)
 
     def with_deflection(self, correction: Array | None) -> "PolicyInputs":
         """The same with another relative change of the deflection."""
-        if correction is self.deflection:
-            return self
-        return PolicyInputs(deflection=correction) if self.is_empty else replace(self, deflection=correction)
+        return self if correction is self.deflection else self._replace(deflection=correction)
 
     @property
     def zmp_shift(self) -> Array | None:

@@ -72,7 +72,7 @@ class Oracle:
             correction + self.integral_gain * self._dt * error, -self.integral_limit, self.integral_limit
         )
         offset, kept = compensator.offset(motion.shifted(wanted), kept)
-        action = (wanted + self._ramp.share(steps) * offset + correction).astype(np.float32)
+        action = (wanted + self._ramp.after(steps) * offset + correction).astype(np.float32)
         new_state = np.hstack([steps, correction, motion.q, kept]), inner
         return action.reshape((*observation.shape[:-1], n)), new_state
 

@@ -160,7 +160,8 @@ class ObservationView:
         Raises:
             ElasticError: It does not have the columns of the table.
         """
-        rows = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+        rows = np.asarray(observation, dtype=np.float64)
+        rows = rows[None] if rows.ndim < 2 else rows
         if rows.ndim != 2 or rows.shape[1] != self._width:
             raise ElasticError(
                 f"an observation must have the {self._width} columns of its table, one row per world, got shape "
@@ -201,7 +202,7 @@ def taken_up(
     memory, inner_state = state
     if len(memory) != len(rows):
         raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {len(memory)}")
-    if episode_start is not None and np.count_nonzero(episode_start) > 0:
+    if episode_start is not None and episode_start is not False and np.count_nonzero(episode_start) > 0:
         fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
         memory = np.where(fresh[:, None], begin(), memory)
     return memory, inner_state

@@ -24,23 +24,28 @@ class Ramp:
     Args:
         model: Assumed robot; a walker gets a shaped ramp where half a period of its sway fits.
         duration_s: Duration of the ramp [s].
+
+    Attributes:
+        table: Share after 0, 1, ... control steps, to the first whose compensation is complete.
     """
 
     def __init__(self, model: RobotModel, duration_s: float) -> None:
         self._duration = max(duration_s, model.control_period_s)
         self._period_s = model.control_period_s
-        self._whole = int(np.argmax(self.is_over(np.arange(np.ceil(self._duration / self._period_s) + 2.0))))
-        """Number of steps from which on the compensation is complete."""
         self._delay = 0.0
         if isinstance(model, WalkerModel):
             half_period = np.pi / sway_frequencies(model.biped, model.plan.pelvis[0], _held_stiffness(model))[0]
             if half_period <= (1.0 - _SHORTEST_SHARE) * duration_s:  # nan is not
                 self._delay = float(half_period)
+        steps = np.arange(np.ceil(self._duration / self._period_s) + 2.0)
+        self.table = self.share(steps[: int(np.argmax(self.is_over(steps))) + 1])
+
+    def after(self, steps: Array) -> Array:
+        """Share after a whole number of control steps, elementwise: `share`, looked up."""
+        return self.table.take(steps.astype(np.intp), mode="clip")
 
     def share(self, steps: Array) -> Array:
         """Share after a number of control steps, elementwise."""
-        if steps.min(initial=np.inf) >= self._whole:
-            return np.ones(steps.shape)
         time, each = steps * self._period_s, self._duration - self._delay
         return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 

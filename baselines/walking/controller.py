@@ -74,8 +74,12 @@ class LocalFrame:
 
 def local_frame(biped: Biped, q: Array, attitude: Array) -> LocalFrame:
     """Local frame from joint angles, (num_worlds, 12) [rad], and roll and pitch, (num_worlds, 2) [rad]."""
-    point = (0.0, 0.0, -biped.ankle_height)
-    return LocalFrame(*biped.chains.com_and_feet(q.reshape(len(q), 2, -1), point, attitude))
+    return LocalFrame(*biped.chains.com_and_feet(q.reshape(len(q), 2, -1), _sole(biped), attitude))
+
+
+def _sole(biped: Biped) -> Array:
+    """Middle of a sole from the ankle, (3,) [m]."""
+    return np.array([0.0, 0.0, -biped.ankle_height])
 
 
 class WalkingController(PolicyWithInputs):
@@ -111,7 +115,7 @@ class WalkingController(PolicyWithInputs):
         self._plan_rows: Any = np.zeros(self._plan.num_steps + 1, kernels.PLAN)
         for name in kernels.PLAN.names or ():
             self._plan_rows[name] = getattr(self._plan, name)
-        self._per_pelvis = center_of_mass_per_pelvis(model)
+        self._sole, self._per_pelvis = _sole(self._biped), center_of_mass_per_pelvis(model)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -131,14 +135,15 @@ class WalkingController(PolicyWithInputs):
         A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as much.
         """
         rows = self._view.rows(observation)
-        frame = local_frame(self._biped, self._view.theta(rows), rows[:, self._attitude])
-        memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(frame))
-        n, kept, action = len(rows), np.empty(memory.shape), np.empty((len(rows), len(self._model.joints)))
+        n, attitude = len(rows), rows[:, self._attitude]
+        com, soles = self._biped.chains.com_and_feet(self._view.theta(rows).reshape(n, 2, 6), self._sole, attitude)
+        memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(LocalFrame(com, soles)))
+        kept, action = np.empty(memory.shape), np.empty((n, 12))
         before, now = self._fields(memory), self._fields(kept)
         is_shifted = inputs.zmp is not None or inputs.com is not None or np.count_nonzero(memory[:, _PLANNED]) > 0
         kept[:, _PLANNED] = self._planned_shift(inputs, memory) if is_shifted else 0.0
         shares = _NO_SHARES if inputs.zmp_shift is None else self._shifted_shares(rows, inputs.zmp_shift)
-        seen = self._observed.fields(rows), frame.com, frame.soles, shares
+        seen = self._observed.fields(rows), com, soles, shares
         walk = self._constants, self._plan_rows, self._ramp
         kernels.control(walk, seen, _dense(inputs, n), before, now, action)
         if is_shifted:

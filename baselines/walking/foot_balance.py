@@ -92,7 +92,7 @@ class FootBalance:
         wrench = old_wrench + self._share(gains.wrench_cutoff_hz) * (wrench - old_wrench)
         q_ref = self._view.motion(rows).q
         shift, turn = self._adjustments(rows, imu, wrench)
-        action = self._ramp.share(steps) * (self._moved(q_ref, shift, turn) - q_ref)
+        action = self._ramp.after(steps) * (self._moved(q_ref, shift, turn) - q_ref)
         kept = np.hstack([steps, imu, wrench])
         return action.astype(np.float32).reshape((*observation.shape[:-1], 12)), (kept, None)
 

@@ -15,7 +15,6 @@ of this one [Kajita2010, section V].
 [Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,14 +94,18 @@ class PostureFeedback(PolicyAround):
         memory, inner = taken_up(
             state, episode_start, rows, self._view, lambda: np.zeros((len(rows), POSTURE_MEMORY.itemsize // 8))
         )
-        others = inputs if inputs.posture_gain is None else replace(inputs, posture_gain=None)
+        others = inputs if inputs.posture_gain is None else inputs._replace(posture_gain=None)
         action, inner = predicted(self._policy, observation, others, inner, episode_start, deterministic)
         total, kept = np.array(action, dtype=np.float64, ndmin=2), np.empty(memory.shape)
-        share = self._ramp.share(memory[:, :1] + 1.0)
-        change = np.zeros(share.shape) if inputs.posture_gain is None else np.ascontiguousarray(inputs.posture_gain)
-        before, now = (np.ndarray(len(rows), POSTURE_MEMORY, np.ascontiguousarray(part)) for part in (memory, kept))
-        hold_posture(self._gains, self._observed.fields(rows), share, change, (before, now), total)
+        change = _NO_CHANGE if inputs.posture_gain is None else np.ascontiguousarray(inputs.posture_gain)
+        before = np.ndarray(len(rows), POSTURE_MEMORY, np.ascontiguousarray(memory))
+        now = np.ndarray(len(rows), POSTURE_MEMORY, kept)
+        hold_posture(self._gains, self._observed.fields(rows), self._ramp.table, change, (before, now), total)
         return total.astype(np.float32).reshape(np.shape(action)), (kept, inner)
+
+
+_NO_CHANGE: Array = np.empty((0, 1))
+"""No change of the gains."""
 
 
 def hip_offsets(turn: Array) -> Array:

@@ -213,8 +213,8 @@ def hold_posture(gains: Any, observed: Any, ramp: Array, change: Array, memory: 
     Args:
         gains: Row of `POSTURE`, (1,).
         observed: Observations, rows with fields.
-        ramp: Share of the feedback, (n, 1) [1].
-        change: Relative change of all gains, (n, 1) [1]; the integral itself goes on as it is.
+        ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
+        change: Relative change of all gains, (n, 1) [1], or none, (0, 1); the integral itself goes on as it is.
         memory: Rows of `POSTURE_MEMORY` before, and to be filled, (n,).
         action: Offsets of the joints, (n, 12) [rad].
     """
@@ -223,12 +223,14 @@ def hold_posture(gains: Any, observed: Any, ramp: Array, change: Array, memory: 
     for world in range(len(action)):
         shown, last, kept = observed[world], before[world], now[world]
         kept.steps = last.steps + 1.0
+        share = ramp[int(min(kept.steps, len(ramp) - 1.0))]
+        further = change[world, 0] if len(change) > 0 else 0.0
         for i in range(2):
             tilt = last.tilt[i] + own.filter_share * (shown.imu_attitude[i] - last.tilt[i])
             integral = last.integral[i] + own.period_s * (tilt - last.integral[i] / own.leak_s)
             kept.tilt[i], kept.integral[i] = tilt, within(integral, own.integral_limit)
             turn = own.proportional * tilt + own.integral * kept.integral[i] + own.derivative * shown.imu_rate[i]
-            turn = ramp[world, 0] * within((1.0 + change[world, 0]) * turn, own.limit_rad)
+            turn = share * within((1.0 + further) * turn, own.limit_rad)
             for leg in range(2):
                 if i == 0:
                     action[world, 6 * leg + 1] += turn

@@ -86,7 +86,7 @@ class LegChains:
         return self.com_and_feet(q)[0]
 
     def com_and_feet(
-        self, q: Array, point: Sequence[float] = (0.0, 0.0, 0.0), attitude: Array | None = None
+        self, q: Array, point: Sequence[float] | Array = (0.0, 0.0, 0.0), attitude: Array | None = None
     ) -> tuple[Array, Array]:
         """Center of mass of the whole robot, and a point that is fixed in each foot, from the pelvis.
 
@@ -98,12 +98,11 @@ class LegChains:
         Returns:
             (..., 3) and (..., L, 3) [m].
         """
-        batch, legs = q.shape[:-2], q.shape[-2]
-        com, feet = np.empty((*batch, 3)), np.empty((*batch, legs, 3))
+        batch, rows = q.shape[:-2], as_rows(q, 2)
+        com, feet = np.empty((len(rows), 3)), np.empty((len(rows), rows.shape[1], 3))
         tilts = _IS_PELVIS if attitude is None else as_rows(attitude, 1)
-        place = np.asarray(point, dtype=np.float64)
-        kernels.local_frames(self.legs, as_rows(q, 2), tilts, place, as_rows(com, 1), as_rows(feet, 2))
-        return com, feet
+        kernels.local_frames(self.legs, rows, tilts, np.asarray(point, dtype=np.float64), com, feet)
+        return com.reshape(*batch, 3), feet.reshape(*batch, rows.shape[1], 3)
 
     def loads(self, rows: int) -> Any:
         """Rows for what loads the legs, (rows,), to be filled."""
