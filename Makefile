@@ -13,7 +13,7 @@ endef
 export WRONG_PYTHON
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format typecheck bench docs clean
+.PHONY: help demo test lint format typecheck bench residuals docs clean
 
 help: ## Show this text
 	@echo "elastic-env: robots with elastic joints, simulated, compensated, identified"
@@ -48,6 +48,9 @@ typecheck: $(STAMP) ## Check types only
 bench: $(STAMP) ## Measure the speed of the simulation, then run the benchmarks if there are any
 	$(BIN)/elastic speed
 	$(if $(wildcard tests/benchmarks),$(BIN)/python -m pytest -o addopts= --benchmark-only tests/benchmarks $(ARGS))
+
+residuals: $(STAMP) ## Train every residual of the package anew and compare it with the old one; takes hours
+	$(BIN)/python -m train.experiments.residuals $(ARGS)
 
 docs: $(STAMP) ## Build the site into docs/_build/html and run the tutorials; warnings are errors
 	@$(BIN)/python -c 'import furo, myst_parser, sphinx_gallery' 2>/dev/null || \

@@ -1,0 +1,109 @@
+"""Every residual of the package trained anew from its configuration, and compared with the one of the package.
+
+    make residuals                                       # or, for some of them:
+    python -m train.experiments.residuals testbed walker_3s_posture --seeds 0 1 --jobs 2
+
+Training and comparison of each are runs in runs/residuals. A call goes on where the last one was interrupted.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from elastic_env.core.config import load_yaml
+from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
+from train.evaluate.conditions import PolicySpec
+from train.experiments.compare import CompareConfig, Comparison, Work, compare
+from train.learn.run_training import resume, start
+from train.learn.train_config import TrainConfig
+from train.runs.folders import CONFIG, RUNS
+from train.workers.places import Place
+
+RESIDUALS = {
+    "testbed": "learned_testbed",
+    "walker_3s": "learned_walker",
+    "walker_1600ms": "learned_walker_1600ms",
+    "walker_3s_posture": "learned_posture",
+}
+"""Residuals of the package: configs/train_NAME.yaml trains them, and this configuration compares them."""
+
+CONFIGS = Path("configs")
+_SHIPPED = Path("baselines/trained")
+
+
+def shipped_seeds(name: str) -> list[int]:
+    """Training seeds of a residual that the package has."""
+    return sorted(int(folder.name.removeprefix("seed_")) for folder in (_SHIPPED / name).glob("seed_*"))
+
+
+def beside_the_shipped(config: CompareConfig, name: str, trained: Path) -> CompareConfig:
+    """A comparison in which the residual of the package stands beside the one that was trained anew.
+
+    Args:
+        config: Comparison with `residual:NAME/seed_*` among its policies.
+        name: Residual of the package.
+        trained: Run of its training.
+
+    Raises:
+        ConfigurationError: The residual is not among the policies.
+    """
+    (shipped,) = [policy for policy in config.policies if policy.name.startswith(f"residual:{name}/")] or [None]
+    if shipped is None:
+        raise ConfigurationError(f"{config.name} does not compare residual:{name}/seed_*; add it to its policies")
+    anew = PolicySpec(name=f"residual:{trained}/seed_*/last", label="trained anew")
+    others = [policy for policy in config.policies if policy is not shipped]
+    own = shipped.replace(label="of the package")
+    return config.replace(name=f"residuals_{name}", policies=[*others, own, anew], figure_policies=[])
+
+
+def reproduce(
+    name: str, folder: Path, console: Console, seeds: Sequence[int], place: Place, configs: Path = CONFIGS
+) -> Comparison:
+    """Train a residual of the package anew, and compare it with that of the package.
+
+    Args:
+        name: Of the residual.
+        folder: For both runs.
+        console: Where progress and tables go.
+        seeds: Training seeds.
+        place: Where training seeds and cells run, and how many at a time.
+        configs: Folder of both configurations.
+    """
+    training, comparison = folder / name / "training", folder / name / "comparison"
+    config = load_yaml(configs / f"train_{name}.yaml", TrainConfig).replace(seeds=list(seeds))
+    if (training / CONFIG).is_file():
+        resume([training], console, place)
+    else:
+        start([config], console, training, place)
+    compared = load_yaml(configs / f"{RESIDUALS[name]}.yaml", CompareConfig)
+    work = Work(place, resumes=(comparison / CONFIG).is_file())
+    return compare(beside_the_shipped(compared, name, training), console, comparison, work)
+
+
+def main(
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    seeds: tuple[int, ...] = (),
+    output: Path = RUNS / "residuals",
+    jobs: int = 0,
+) -> None:
+    """Train residuals of the package anew and compare them with those of the package; all takes hours.
+
+    Args:
+        names: Residuals of the package; all if none is named.
+        seeds: Training seeds; by default those that the package has.
+        output: Folder for the runs; runs that are there are gone on with.
+        jobs: Training seeds and cells at the same time, 0 for one per core.
+    """
+    try:
+        require_known("residual of the package", names, RESIDUALS)
+        for name in names or RESIDUALS:
+            reproduce(name, output, Console(), seeds or shipped_seeds(name), Place(jobs=jobs))
+    except ElasticError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
