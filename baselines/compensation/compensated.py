@@ -41,6 +41,10 @@ class Compensated(PolicyWithInputs):
         self._shows_rates = getattr(policy, "reads_rates", True)
         self._view = ObservationView(model.observation_table, model.control_period_s)
         self._ramp = Ramp(model, ramp_s)
+        self._plan = None
+        if isinstance(model, WalkerModel):
+            table = model.observation_table
+            self._plan = table.group("load_share"), table.group("zmp_reference"), model.biped.foot_spacing
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -85,13 +89,12 @@ class Compensated(PolicyWithInputs):
 
     def _shifted(self, rows: Array, inputs: PolicyInputs) -> Array:
         """The observations with ZMP and load share of the plan as the inputs shift them."""
-        shift, model = inputs.zmp_shift, self.compensator.model
-        if shift is None or not isinstance(model, WalkerModel):
+        shift = inputs.zmp_shift
+        if shift is None or self._plan is None:
             return rows
-        rows, table = rows.copy(), model.observation_table
-        share, zmp = table.group("load_share"), table.group("zmp_reference")
+        rows, (share, zmp, spacing) = rows.copy(), self._plan
         rows[:, zmp] += shift
-        rows[:, share] = shifted_share(rows[:, share], shift[:, 1:], model.biped.foot_spacing)
+        rows[:, share] = shifted_share(rows[:, share], shift[:, 1:], spacing)
         return rows
 
     def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
