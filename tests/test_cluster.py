@@ -79,6 +79,31 @@ def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> 
     assert isinstance(outcomes[1].error, WorkerKilledError)  # type: ignore[union-attr]
 
 
+def processes_of(parent: int) -> set[int]:
+    """Processes of Python that a process has started, without the tracker that Python starts for itself."""
+    lists = Path(f"/proc/{parent}/task").glob("*/children")
+    found = [child for file in lists for child in file.read_text().split()]
+    return {int(child) for child in found if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()}
+
+
+def helpers_killed(known: set[int], report: Callable[[int], None]) -> str:
+    """Kills what the program has started beside its worker, then reports."""
+    for other in processes_of(os.getppid()) - known - {os.getpid()}:
+        os.kill(other, signal.SIGKILL)
+    report(1)
+    return "fine"
+
+
+def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path: Path) -> None:
+    """Catches a call that fails, with an error of its connection, where a helper of the program is killed."""
+    known, reports = processes_of(os.getpid()), list[Any]()
+    watch = Watch(reported=lambda number, value: reports.append((number, value)))
+    with Place(jobs=1).opened(2, tmp_path) as pool:
+        outcomes = run_calls(helpers_killed, [(known,)] * 2, pool, watch)
+    assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine"] * 2
+    assert reports == [(0, 0), (0, 1), (1, 0), (1, 1)]
+
+
 def test_a_kept_cell_is_what_was_played(tmp_path: Path) -> None:
     """Catches a digit, a type or an order that the file loses."""
     store, played = Store(tmp_path / "cells"), evaluate(CONDITIONS[0], num_threads=1)
@@ -224,7 +249,7 @@ def test_a_script_whose_processes_import_it_is_told_so(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(UNGUARDED)
     run = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert run.returncode == 1
-    assert run.stdout == "run\nrun\n"
+    assert 2 <= run.stdout.count("run\n") <= 3  # the second worker may be ended before it comes that far
     assert run.stderr.count("Traceback") == 1
     assert 'must do so below if __name__ == "__main__":' in run.stderr.splitlines()[-1]
 

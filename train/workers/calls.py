@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from elastic_env.core.errors import ElasticError, SystemFailedError
+from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
 from train.workers.versions import VersionsDifferError, everything, require_same
 
 MOST_MOVES = 2
@@ -45,6 +45,16 @@ class WorkerKilledError(SystemFailedError):
 
 class PlaceLostError(SystemFailedError):
     """What runs the calls is gone: the scheduler of a cluster."""
+
+
+class UnguardedScriptError(ConfigurationError):
+    """Workers import the script that runs here, and it would start workers again. An executor's future raises it."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a process ended while it started; a script that starts processes must do so below "
+            'if __name__ == "__main__": since each of them imports the script'
+        )
 
 
 @dataclass(frozen=True)
@@ -160,6 +170,7 @@ def run_calls(
     Raises:
         VersionsDifferError: A machine has other versions.
         PlaceLostError: The executor is gone.
+        UnguardedScriptError: Workers cannot import the script that runs here.
         KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
     """
     run = _Run(function, arguments, pool, watch)
@@ -224,7 +235,7 @@ class _Run:
     def _end(self, number: int, future: Future[Any]) -> None:
         self._running.discard(number)
         outcome = _outcome(future)
-        if isinstance(outcome.error, VersionsDifferError | PlaceLostError):
+        if isinstance(outcome.error, VersionsDifferError | PlaceLostError | UnguardedScriptError):
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
             if self._is_ending:

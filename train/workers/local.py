@@ -6,16 +6,18 @@ import queue
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
-from multiprocessing.managers import SyncManager
-from typing import Any
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from typing import Any, cast
 
 from elastic_env.core.errors import ConfigurationError, shown
-from train.workers.calls import Pool, WorkerLostError
+from train.workers.calls import Pool, UnguardedScriptError, WorkerLostError
 
 _MOST_JOBS = 1024
 
@@ -39,143 +41,144 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
         jobs: Processes, 0 for one per core.
         calls: How many calls there will be; there are no more processes than that.
     """
-    context = multiprocessing.get_context("spawn")
-    manager = SyncManager(ctx=context)
-    with _ctrl_c_held():
-        _start(manager)
-    with manager:
-        reports = manager.Queue()
-        processes = Processes(min(jobs or os.cpu_count() or 1, calls), context)
-        pool = Pool(processes, _Put(reports))
-        pump = threading.Thread(target=_forward, args=(reports, pool.events), daemon=True)
-        pump.start()
-        try:
-            yield pool
-        except BaseException:
-            processes.end()
-            raise
-        processes.shutdown()
-        reports.put(None)
-        pump.join()
-
-
-def _start(manager: SyncManager) -> None:
-    """Start the first process.
-
-    Raises:
-        ConfigurationError: It ended at once: it imports the script that runs here, which starts processes itself.
-    """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        sys.exit(1)  # this is that process; the one that started it says why
+        sys.exit(1)  # this is a worker that imports the script of its parent, which says why it ended
+    resource_tracker.ensure_running()  # its start lets SIGINT through, and the threads that start workers block it
+    events: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    processes = Processes(min(jobs or os.cpu_count() or 1, calls), events)
     try:
-        manager.start(_follow_parent)
-    except EOFError:
-        raise ConfigurationError(
-            "a process ended while it started; a script that starts processes must do so below "
-            'if __name__ == "__main__": since each of them imports the script'
-        ) from None
+        yield Pool(processes, _report, events)
+    except BaseException:
+        processes.end()
+        raise
+    processes.shutdown()
 
 
 class Processes(Executor):
     """An executor of processes, in which a process that dies fails its own call alone.
 
     In a `ProcessPoolExecutor` it fails all calls, and none knows whose process it was. So each process here has a pool
-    of its own, and a thread that waits for it.
+    of its own, a thread that waits for it, and a pipe for its reports.
     """
 
-    def __init__(self, jobs: int, context: Any) -> None:
+    def __init__(self, jobs: int, events: "queue.SimpleQueue[Any]") -> None:
         self._threads = ThreadPoolExecutor(jobs, initializer=_block_ctrl_c)
-        self._context, self._own, self._lock = context, threading.local(), threading.Lock()
-        self._pools, self._is_closed = set[ProcessPoolExecutor](), False
+        self._own, self._lock, self._events = threading.local(), threading.Lock(), events
+        self._workers, self._is_closed = set[_Worker](), False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """See `Executor`; the future raises `WorkerLostError` where the process died."""
+        """See `Executor`.
+
+        The future raises `WorkerLostError` where the process died, and `UnguardedScriptError` where it ended itself
+        before it could begin.
+        """
         return self._threads.submit(self._in_process, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """See `Executor`."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
-        for pool in self._pools:
-            pool.shutdown(wait)
+        for worker in self._workers:
+            worker.pool.shutdown(wait)
 
     def end(self) -> None:
         """Stop at once: what is queued is dropped, what runs is ended."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             self._is_closed = True
-            workers = [worker for pool in self._pools for worker in (getattr(pool, "_processes", None) or {}).values()]
-        for worker in workers:
-            worker.terminate()
-        for worker in workers:
-            worker.join()
+            processes = [worker.process for worker in self._workers]
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join()
 
     def _in_process(self, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """In a thread: a call in the thread's process."""
         try:
             with self._lock:  # no process begins behind `end`
-                future = self._pool().submit(fn, *args, **kwargs)
+                future = self._worker().pool.submit(fn, *args, **kwargs)
             return future.result()
         except BrokenProcessPool:
+            lost, self._own.worker = self._own.worker, None
             with self._lock:
-                self._pools.discard(self._own.pool)
-            self._own.pool = None
-            raise WorkerLostError("a worker process was killed") from None
+                self._workers.discard(lost)
+            raise lost.why() from None
 
-    def _pool(self) -> ProcessPoolExecutor:
+    def _worker(self) -> "_Worker":
         if self._is_closed:
             raise WorkerLostError("the workers have been ended")
-        if getattr(self._own, "pool", None) is None:
-            self._own.pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_follow_parent)
-            self._pools.add(self._own.pool)
-        return self._own.pool
+        if getattr(self._own, "worker", None) is None:
+            self._own.worker = _Worker(self._events)
+            self._workers.add(self._own.worker)
+        return self._own.worker
 
 
-class _Put:
-    """Reports into a queue of a manager: a worker that is killed within leaves no lock behind."""
+class _Worker:
+    """A process, and a thread that takes its reports.
 
-    def __init__(self, reports: "queue.Queue[Any]") -> None:
-        self._reports = reports
-
-    def __call__(self, number: int, value: Any) -> None:
-        self._reports.put((number, value))
-
-
-def _forward(reports: "queue.Queue[Any]", events: "queue.SimpleQueue[Any]") -> None:
-    """In a thread: hand on what is reported, until None is."""
-    try:
-        while (report := reports.get()) is not None:
-            events.put(report)
-    except (EOFError, OSError):  # the manager is gone, with the workers
-        return
-
-
-@contextmanager
-def _ctrl_c_held() -> Iterator[None]:
-    """Keep SIGINT waiting while a process is started: it begins with it blocked, as the parent is then.
-
-    Else it could end it, with a traceback, in the second in which it imports and cannot yet ignore it.
+    Attributes:
+        pool: Runs calls in it.
+        process: The process.
     """
-    resource_tracker.ensure_running()  # its own start would let SIGINT through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def __init__(self, events: "queue.SimpleQueue[Any]") -> None:
+        context = multiprocessing.get_context("spawn")
+        reports, end = context.Pipe(duplex=False)
+        self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(end,))
+        self.pool.submit(_nothing)  # starts it
+        (self.process,) = cast("dict[int, SpawnProcess]", self.pool._processes).values()
+        end.close()  # with that of the process the pipe ends too
+        self._has_begun = False
+        self._reader = threading.Thread(target=self._read, args=(reports, events), daemon=True)
+        self._reader.start()
+
+    def why(self) -> Exception:
+        """Why a call in it was lost."""
+        self._reader.join()
+        while (code := self.process.exitcode) is None:  # another thread is about to learn it
+            time.sleep(0.01)
+        return WorkerLostError("a worker process was killed") if self._has_begun or code < 0 else UnguardedScriptError()
+
+    def _read(self, reports: "Connection[Any, Any]", events: "queue.SimpleQueue[Any]") -> None:
+        """In a thread: hand on what is reported, as long as the process lives."""
+        with reports, suppress(EOFError, OSError):
+            self._has_begun = reports.recv()
+            while True:
+                events.put(reports.recv())
+
+
+def _nothing() -> None:
+    """A first call, with which a process starts."""
 
 
 def _block_ctrl_c() -> None:
-    """In a thread that starts processes: they begin with SIGINT blocked."""
+    """In a thread that starts processes: they begin with SIGINT blocked, as the thread has it.
+
+    Else it could end one, with a traceback, in the second in which it imports and cannot yet ignore it.
+    """
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
 
-def _follow_parent() -> None:
-    """In a worker: the parent decides what happens.
+_own_end: "Connection[Any, Any] | None" = None
+"""In a worker: its end of the pipe for reports."""
+
+
+def _report(number: int, value: Any) -> None:
+    """In a worker: report on a call."""
+    if _own_end is not None:
+        _own_end.send((number, value))
+
+
+def _begin(end: "Connection[Any, Any]") -> None:
+    """In a worker, before its first call: the parent decides what happens.
 
     Ctrl-C reaches the whole process group and is left to the parent; a parent that is killed takes its workers with
     it, so that none of them goes on writing beside a run that was resumed.
     """
+    global _own_end
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    end.send(True)
+    _own_end = end
 
 
 def _end_with_parent() -> None:
