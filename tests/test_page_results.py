@@ -14,13 +14,14 @@ from elastic_env.core.errors import ConfigurationError
 from train.report.leaderboard import leaderboard_markdown, read_leaderboard
 from train.report.pages.cells import KEPT, Cells, Kept, condensed, keep, read_rows, scaled
 from train.report.pages.learned import MAPS, learned_maps
-from train.report.pages.write import PARTS, TABLES, Results, figure, marks, page_with, pages, reads
+from train.report.pages.write import PARTS, PICTURES, TABLES, Results, figure, marks, page_with, pages, reads
 from train.report.pages.write import main as write_pages
 from train.runs.escaping import write_records
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 FILES = sorted(path.stem for path in RESULTS.glob("*.csv"))
+DRAWN = {name for picture in PICTURES.values() for name in picture.reads}
 BEGIN, END = marks("leaderboard")
 
 
@@ -62,8 +63,8 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_every_table_is_known_and_says_where_it_comes_from() -> None:
     """Catches a CSV file that no page reads, and one of which nobody knows the command."""
     assert set(FILES) == {*TABLES, *MAPS, "leaderboard"}
-    shown = set().union(*(reads(page.read_text(encoding="utf-8")) for page in pages(ROOT)))
-    assert shown == set(FILES)
+    docs = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    assert set().union(*(reads(page.read_text(encoding="utf-8")) for page in docs)) == set(FILES)
 
 
 def test_pages_are_those_of_the_results_beside_them() -> None:
@@ -72,13 +73,15 @@ def test_pages_are_those_of_the_results_beside_them() -> None:
     shown = {page.name: page.read_text(encoding="utf-8") for page in pages(ROOT)}
     assert {"README.md", "leaderboard.md", "learned.md", "walker.md", "testbed.md", "iterative.md"} <= set(shown)
     assert {name: page_with(text, results) for name, text in shown.items()} == shown
+    for name, picture in PICTURES.items():
+        assert (ROOT / "docs" / "images" / name).read_text(encoding="utf-8") == picture.text(results)
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other(name: str, tmp_path: Path) -> None:
     """Catches a page that repeats a figure outside its marks, and a part that ignores its table."""
     place = {"x", "y", "failed", "episodes", "training_seeds", "seeds", "covered", "stiffness_nm_per_rad"}
-    place |= {"damping_nms_per_rad", "joints"}
+    place |= {"damping_nms_per_rad", "joints", "time_s", "single_support"}
     changed = with_changed(name, lambda key, text: text if key in place else larger(text), tmp_path)
     before = results_of_the_docs()
     for part, own in PARTS.items():
@@ -86,7 +89,9 @@ def test_changed_figures_of_a_table_change_every_page_that_shows_it_and_no_other
         assert (own.text(changed) != own.text(before)) == (name in own.reads and not pictures), part
     for page in pages(ROOT):
         text = page.read_text(encoding="utf-8")
-        assert (page_with(text, changed) != text) == (name in reads(text)), page.name
+        assert (page_with(text, changed) != text) == (name in reads(text) and name not in DRAWN), page.name
+    for own in PICTURES.values():
+        assert (own.text(changed) != own.text(before)) == (name in own.reads)
 
 
 @pytest.mark.parametrize(

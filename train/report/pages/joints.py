@@ -1,4 +1,4 @@
-"""Tables of the testbed's page, from the kept cells of comparisons and from `train.experiments.statics`."""
+"""Tables of the testbed's page, from the kept cells of comparisons and from `train.experiments.pages.statics`."""
 
 from collections.abc import Mapping, Sequence
 

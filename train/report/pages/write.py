@@ -15,6 +15,7 @@ from pathlib import Path
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
+from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
 from train.report.pages import joints, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
@@ -39,8 +40,10 @@ TABLES = {
         kept.table or name: f"python -m train.report.pages.keep writes it from a run of configs/{name}.yaml"
         for name, kept in KEPT.items()
     },
+    "step": "python -m train.experiments.pages.step writes it",
     **dict.fromkeys(
-        ("identification", "output_compensator", "gravity_torque"), "python -m train.experiments.statics writes it"
+        ("identification", "output_compensator", "gravity_torque"),
+        "python -m train.experiments.pages.statics writes it",
     ),
 }
 """Tables of the results, and where they come from."""
@@ -176,6 +179,8 @@ PARTS: Mapping[str, Part] = {
     **{name: _of_map(name) for name in MAPS},
 }
 """Parts of pages by the name of their marks."""
+PICTURES: Mapping[str, Part] = {"step_errors.svg": _of(step_svg, "step")}
+"""Pictures in docs/images that are drawn from the results."""
 
 _FIGURE = re.compile(r"<!-- = (.*?) -->(.*?)<!-- / -->")
 
@@ -229,6 +234,7 @@ def page_with(text: str, results: Results) -> str:
 def reads(text: str) -> set[str]:
     """Names of the results that a page shows."""
     shown = {name for part, own in PARTS.items() if marks(part)[0] in text for name in own.reads}
+    shown |= {name for picture, own in PICTURES.items() if f"images/{picture}" in text for name in own.reads}
     return shown | {place.partition("; ")[0] for place, _ in _FIGURE.findall(text)}
 
 
@@ -246,4 +252,8 @@ def main(arguments: Sequence[str]) -> None:
     found, results = pages(root), Results.read(root / "docs" / "results")
     for page in found:
         page.write_text(page_with(page.read_text(encoding="utf-8"), results), encoding="utf-8")
+    for name, picture in PICTURES.items():
+        images = root / "docs" / "images"
+        images.mkdir(exist_ok=True)
+        (images / name).write_text(picture.text(results), encoding="utf-8")
     print(f"{len(found)} pages written: {', '.join(str(page.relative_to(root)) for page in found)}")
