@@ -2,7 +2,6 @@
 
 import csv
 import re
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,10 +35,6 @@ from train.report.leaderboard import (
     three_digits,
     write_leaderboard,
 )
-from train.report.pages.learned import MAPS
-from train.report.pages.write import TABLES, marks, page_with, pages
-from train.report.pages.write import Results as PageResults
-from train.report.pages.write import main as write_pages
 from train.runs.folders import run_folder
 
 ROOT = Path(__file__).parents[1]
@@ -212,72 +207,6 @@ def test_all_forms_have_the_same_figures() -> None:
     assert lines[0][:3] == ["learned", "both, 3 s", "pelvis error rms"]
     assert lines[0][3].endswith("(base)")
     assert lines[0][4].endswith("(best)")
-
-
-BEGIN, END = marks("leaderboard")
-
-
-def checkout() -> PageResults:
-    """A checkout with results and without pages, in the working directory; its results."""
-    results = Path("docs", "results")
-    results.mkdir(parents=True)
-    write_leaderboard(rows(), results)
-    for table in [*TABLES, *(f"{name}.csv" for name in MAPS)]:
-        shutil.copy(ROOT / "docs" / "results" / table, results)
-    return PageResults.read(results)
-
-
-def test_a_page_is_written_between_its_marks_and_nowhere_else() -> None:
-    """Catches text of the page that is lost, tables that pile up, and a page without marks."""
-    results, page = checkout(), Path("README.md")
-    page.write_text(f"before\n{BEGIN}\nold 1.23\n{END}\nafter\n")
-    Path("docs", "other.md").write_text("no marks")
-    for _ in range(2):
-        write_pages([])
-        assert page.read_text() == f"before\n{BEGIN}\n\n{leaderboard_markdown(rows())}\n{END}\nafter\n"
-    assert Path("docs", "other.md").read_text() == "no marks"
-    for text in ("no marks", f"{END}\n{BEGIN}", f"{BEGIN}\n{END}\n{BEGIN}\n{END}"):
-        with pytest.raises(ConfigurationError, match="needs the lines"):
-            page_with(text, results)
-    Path("other.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ConfigurationError, match=r"other.csv is no leaderboard.csv: its columns must be track, policy"):
-        read_leaderboard(Path("other.csv"))
-    Path("docs", "results", "gallery.csv").unlink()
-    with pytest.raises(ConfigurationError, match=r"gallery.csv is missing; python -m train.experiments.gallery"):
-        write_pages([])
-    Path("docs", "results", "demo_episodes.csv").unlink()
-    with pytest.raises(ConfigurationError, match=r"demo_episodes.csv is missing; copy it from runs/demo"):
-        write_pages([])
-
-
-def test_pages_of_the_docs_are_those_of_the_results_beside_them() -> None:
-    """Catches a figure that somebody typed, and results that were renewed without the page."""
-    found, results = pages(ROOT), PageResults.read(ROOT / "docs" / "results")
-    shown = {page.name: page.read_text(encoding="utf-8") for page in found}
-    assert {"README.md", "leaderboard.md", "learned.md"} <= set(shown)
-    assert {name: page_with(text, results) for name, text in shown.items()} == shown
-
-
-def test_one_changed_number_changes_every_page_that_shows_it() -> None:
-    """Catches a page that repeats a figure outside its marks, and a part that ignores the results."""
-    results = PageResults.read(ROOT / "docs" / "results")
-    found = [s for s in results.standings if s.training_seeds and s.is_column]
-    assert found[0].base is not None
-    base = replace(found[0].base, change=Estimate(-0.985, -0.99, -0.98))
-    walks = [{**row, "pelvis_roll_peak_rad": row["pelvis_roll_peak_rad"] and "0.0777"} for row in results.walks]
-    gallery = [{**row, "uncompensated_peak_m": "0.0888"} for row in results.gallery]
-    standings = [replace(s, base=base) if s is found[0] else s for s in results.standings]
-    learned = [{**row, "base_mean": "0.0666"} for row in results.learned]
-    maps = {name: [replace(m, y_is="another axis") for m in own] for name, own in results.maps.items()}
-    changed = PageResults(standings, walks, gallery, learned, maps)
-    of_standings = ("README.md", "leaderboard.md", "learned.md")
-    for page in pages(ROOT):
-        text = page.read_text(encoding="utf-8")
-        assert ("77.7" in page_with(text, changed)) == (page.name == "README.md")
-        assert ("88.8" in page_with(text, changed)) == (page.name == "gallery.md")
-        assert ("[−99, −98]" in page_with(text, changed)) == (page.name in of_standings)
-        assert ("66.6" in page_with(text, changed)) == (page.name == "learned.md")
-        assert ("another axis" in page_with(text, changed)) == (page.name == "maps.md")
 
 
 # The configuration.

@@ -2,20 +2,23 @@
 
     python -m train.report.pages          # README.md and docs/*.md from docs/results
 
-A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. The tool
-writes every part anew. A test fails where a page and the results disagree.
+A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. A figure
+within a sentence stands between `<!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->` and `<!-- / -->`.
+The tool writes all of them anew. A test fails where a page and the results disagree.
 """
 
-import csv
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
+from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
+from train.report.pages import joints, walks
+from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
 from train.report.pages.learned import MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
 
@@ -29,9 +32,19 @@ _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
 TABLES = {
-    "demo_episodes.csv": "copy it from runs/demo/episodes.csv after `elastic demo`",
-    "gallery.csv": "python -m train.experiments.gallery writes it",
-    "learned_posture.csv": "copy it from statistics.csv after `elastic compare configs/learned_posture.yaml`",
+    "demo_episodes": "copy it from runs/demo/episodes.csv after `elastic demo`",
+    "gallery": "python -m train.experiments.gallery writes it",
+    "learned_posture": "copy it from statistics.csv after `elastic compare configs/learned_posture.yaml`",
+    "drawn_robots": "copy it from robots.csv after `elastic compare configs/drawn_robots.yaml`",
+    **{
+        kept.table or name: f"python -m train.report.pages.keep writes it from a run of configs/{name}.yaml"
+        for name, kept in KEPT.items()
+    },
+    "step": "python -m train.experiments.pages.step writes it",
+    **dict.fromkeys(
+        ("identification", "output_compensator", "gravity_torque"),
+        "python -m train.experiments.pages.statics writes it",
+    ),
 }
 """Tables of the results, and where they come from."""
 
@@ -42,17 +55,13 @@ class Results:
 
     Attributes:
         standings: Rows of the leaderboard.
-        walks: Episodes of `elastic demo`, a column of `episodes.csv` by its name.
-        gallery: Robots of the gallery, a column of `gallery.csv` by its name.
-        learned: Changes by the residual on `adaptive_posture`, a column of `statistics.csv` by its name.
         maps: Maps of what learning adds, by the name of their file.
+        tables: Rows of the other tables, by the name of their file.
     """
 
     standings: Sequence[Standing]
-    walks: Sequence[Mapping[str, str]]
-    gallery: Sequence[Mapping[str, str]] = ()
-    learned: Sequence[Mapping[str, str]] = ()
-    maps: Mapping[str, Sequence[LearnedMap]] = field(default_factory=dict)
+    maps: Mapping[str, Sequence[LearnedMap]]
+    tables: Mapping[str, Rows]
 
     @classmethod
     def read(cls, folder: Path) -> "Results":
@@ -62,22 +71,17 @@ class Results:
             ConfigurationError: A table is missing, or not one of ours.
         """
         for name, source in TABLES.items():
-            if not (folder / name).is_file():
-                raise ConfigurationError(f"{folder / name} is missing; {source}")
+            if not (folder / f"{name}.csv").is_file():
+                raise ConfigurationError(f"{folder / name}.csv is missing; {source}")
         maps = {name: learned_maps(folder / f"{name}.csv") for name in MAPS}
-        walks, gallery, learned = (_rows(folder / name) for name in TABLES)
-        return cls(read_leaderboard(folder / "leaderboard.csv"), walks, gallery, learned, maps)
+        tables = {name: read_rows(folder / f"{name}.csv") for name in TABLES}
+        return cls(read_leaderboard(folder / "leaderboard.csv"), maps, tables)
 
 
-def _rows(table: Path) -> list[dict[str, str]]:
-    with table.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def walks_beside_the_paper(results: Results) -> str:
+def walks_beside_the_paper(walks: Rows) -> str:
     """Largest roll and pitch of the walks in `nominal` without and with compensation, and those of the paper."""
     rows = []
-    for row in results.walks:
+    for row in walks:
         if row["scenario"] == "nominal" and row["policy"] in PAPER_PELVIS and row[_PEAKS[0]]:  # else the testbed's
             roll, pitch = (f"{1e3 * float(row[name]):.1f}" for name in _PEAKS)
             rows.append([row["reference"], _TITLES[row["policy"]], roll, pitch, PAPER_PELVIS[row["policy"]]])
@@ -85,10 +89,10 @@ def walks_beside_the_paper(results: Results) -> str:
     return markdown_table(head, ["---"] * 2 + ["---:"] * 3, rows) + "\n"
 
 
-def learning_in_short(results: Results) -> str:
+def learning_in_short(standings: Sequence[Standing]) -> str:
     """What learning adds in the motion that comes first: over its base, and over the best policy without learning."""
-    first = results.standings[0].reference
-    found = [s for s in results.standings if s.training_seeds and s.reference == first and s.scope in _SHORT]
+    first = standings[0].reference
+    found = [s for s in standings if s.training_seeds and s.reference == first and s.scope in _SHORT]
     titles = list(dict.fromkeys(s.title for s in found))
     rows = [
         [f"{policy}, {scope}", *(shown for title in titles for shown in _over(own, title))]
@@ -104,10 +108,10 @@ def _over(standings: Sequence[Standing], title: str) -> tuple[str, str]:
     return changed(own.base), "as (a)" if own.rival is None else changed(own.rival)
 
 
-def gallery_table(results: Results) -> str:
+def gallery_table(gallery: Rows) -> str:
     """How far the robots of the gallery sag, with and without compensation."""
     rows = []
-    for row in results.gallery:
+    for row in gallery:
         least, most = (float(row[f"stiffness_{which}_Nm_per_rad"]) for which in ("least", "most"))
         deviations = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
         rows.append(
@@ -121,29 +125,84 @@ def gallery_table(results: Results) -> str:
     return markdown_table(head, ["---", "---:", "---", "---", *["---:"] * 6], rows) + "\n"
 
 
-def gallery_pictures(results: Results) -> str:
+def gallery_pictures(gallery: Rows) -> str:
     """Pictures of the robots of the gallery, each under its name."""
     return "\n".join(
         f"**{row['title']}**\n\n![{row['title']} without and with compensation](images/gallery/{row['robot']}.png)\n"
-        for row in results.gallery
+        for row in gallery
     )
 
 
-def _map_part(name: str, results: Results) -> str:
-    return maps_markdown(results.maps[name])
+@dataclass(frozen=True)
+class Part:
+    """A part of a page: the results that it shows, and its text."""
+
+    reads: Sequence[str]
+    text: Callable[[Results], str]
 
 
-PARTS: Mapping[str, Callable[[Results], str]] = {
-    "leaderboard": lambda results: leaderboard_markdown(results.standings),
-    "what learning adds": lambda results: claims_markdown(results.standings),
-    "learning in short": learning_in_short,
-    "walks beside the paper": walks_beside_the_paper,
-    "gallery": gallery_table,
-    "gallery pictures": gallery_pictures,
-    "learned posture": lambda results: changes_table(results.learned),
-    **{name: partial(_map_part, name) for name in MAPS},
+def _of(text: Callable[..., str], *tables: str) -> Part:
+    return Part(tables, lambda results: text(*(results.tables[name] for name in tables)))
+
+
+def _of_standings(text: Callable[[Sequence[Standing]], str]) -> Part:
+    return Part(["leaderboard"], lambda results: text(results.standings))
+
+
+def _of_map(name: str) -> Part:
+    return Part([name], lambda results: maps_markdown(results.maps[name]))
+
+
+PARTS: Mapping[str, Part] = {
+    "leaderboard": _of_standings(leaderboard_markdown),
+    "what learning adds": _of_standings(claims_markdown),
+    "learning in short": _of_standings(learning_in_short),
+    "published controllers": _of_standings(walks.published_controllers),
+    "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
+    "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
+    "gallery": _of(gallery_table, "gallery"),
+    "gallery pictures": _of(gallery_pictures, "gallery"),
+    "learned posture": _of(changes_table, "learned_posture"),
+    "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
+    "errors of the IMU": _of(walks.imu_errors, "walker_imu"),
+    "gravity torques": _of(walks.gravity_torques, "gravity_torque"),
+    "sensitivity of the walk": _of(walks.sensitivity, "walker_sensitivity"),
+    "walks of the paper": _of(walks.paper_walks, "paper", "walker"),
+    "local frame": _of(walks.local_frame, "paper"),
+    "walks in all scenarios": _of(walks.all_scenarios, "walker"),
+    "testbed of the paper": _of(joints.paper_testbed, "paper_testbed", "identification"),
+    "identification": _of(joints.identification, "identification"),
+    "output compensators": _of(joints.output_compensators, "output_compensator"),
+    "damping of the testbed": _of(joints.damping, "testbed_damping", "identification"),
+    "testbed in all scenarios": _of(joints.scenarios, "testbed"),
+    "testbed's rivals": _of(joints.rivals, "testbed_rivals"),
+    **{name: _of_map(name) for name in MAPS},
 }
 """Parts of pages by the name of their marks."""
+PICTURES: Mapping[str, Part] = {"step_errors.svg": _of(step_svg, "step")}
+"""Pictures in docs/images that are drawn from the results."""
+
+_FIGURE = re.compile(r"<!-- = (.*?) -->(.*?)<!-- / -->")
+
+
+def figure(results: Results, place: str, now: str) -> str:
+    """A figure within a sentence, with as many decimals as it has now.
+
+    Args:
+        results: The results.
+        place: Table, policy, reference, scenario, metric, and a statistic where it is not the first one.
+        now: The text between its marks.
+
+    Raises:
+        ConfigurationError: There is no such figure.
+    """
+    table, *cell, metric = [part.strip() for part in place.split("; ")]
+    statistic = cell.pop() if len(cell) == 4 else ""
+    if table not in results.tables or len(cell) != 3:
+        raise ConfigurationError(f"{place!r} is no figure: give table; policy; reference; scenario; statistic; metric")
+    row = Cells(results.tables[table]).row(*cell, statistic=statistic)
+    decimals = len(now.partition(".")[2])
+    return minus(f"{scaled(row, metric):.{decimals}f}")
 
 
 def marks(part: str) -> tuple[str, str]:
@@ -152,24 +211,31 @@ def marks(part: str) -> tuple[str, str]:
 
 
 def has_parts(text: str) -> bool:
-    """Whether a page has a mark of any part."""
-    return any(mark in text for part in PARTS for mark in marks(part))
+    """Whether a page has a mark of any part or figure."""
+    return _FIGURE.search(text) is not None or any(mark in text for part in PARTS for mark in marks(part))
 
 
 def page_with(text: str, results: Results) -> str:
-    """A page with every part between its marks written anew.
+    """A page with every part and every figure between its marks written anew.
 
     Raises:
         ConfigurationError: It has no marks of any part, or not both of a part, each once and in order.
     """
     parts = [part for part in PARTS if any(mark in text for mark in marks(part))]
-    for part in parts or PARTS:
+    for part in parts or ([] if _FIGURE.search(text) else PARTS):
         begin, end = marks(part)
         if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
             raise ConfigurationError(f"a page for the {part} needs the lines {begin!r} and {end!r}, each once")
         before, _, rest = text.partition(begin)
-        text = f"{before}{begin}\n\n{PARTS[part](results)}\n{end}{rest.partition(end)[2]}"
-    return text
+        text = f"{before}{begin}\n\n{PARTS[part].text(results)}\n{end}{rest.partition(end)[2]}"
+    return _FIGURE.sub(lambda m: f"<!-- = {m[1]} -->{figure(results, m[1], m[2])}<!-- / -->", text)
+
+
+def reads(text: str) -> set[str]:
+    """Names of the results that a page shows."""
+    shown = {name for part, own in PARTS.items() if marks(part)[0] in text for name in own.reads}
+    shown |= {name for picture, own in PICTURES.items() if f"images/{picture}" in text for name in own.reads}
+    return shown | {place.partition("; ")[0] for place, _ in _FIGURE.findall(text)}
 
 
 def pages(root: Path) -> list[Path]:
@@ -186,4 +252,8 @@ def main(arguments: Sequence[str]) -> None:
     found, results = pages(root), Results.read(root / "docs" / "results")
     for page in found:
         page.write_text(page_with(page.read_text(encoding="utf-8"), results), encoding="utf-8")
+    for name, picture in PICTURES.items():
+        images = root / "docs" / "images"
+        images.mkdir(exist_ok=True)
+        (images / name).write_text(picture.text(results), encoding="utf-8")
     print(f"{len(found)} pages written: {', '.join(str(page.relative_to(root)) for page in found)}")

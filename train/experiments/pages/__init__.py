@@ -1,0 +1,1 @@
+"""Measurements and pictures of the documentation that no command makes."""

@@ -1,0 +1,123 @@
+"""Tables of the testbed's page, from the kept cells of comparisons and from `train.experiments.pages.statics`."""
+
+from collections.abc import Mapping, Sequence
+
+from train.report.pages.cells import Cells, Rows, failed, minus, scaled
+from train.runs.escaping import markdown_table
+
+ERROR = "link_error_rms_rad"
+_AT_REST = ("link_error_imu_min_rad", "link_error_imu_max_rad")
+_PAPER = {"r": "0.9775", "uncompensated": "−56.2 to +41.7 mrad", "input": "−3.7 to +7.1 mrad"}
+_NOT_PLAYED = "–"
+_RIVALS = ("input", "dynamic", "friction", "disturbance_observer")
+
+
+def _figures(count: int) -> list[str]:
+    return ["---:"] * count
+
+
+def paper_testbed(rows: Rows, identified: Rows) -> str:
+    """Figs. 5 and 6 of the paper, beside the paper's figures."""
+    cells = Cells(rows)
+    (nominal,) = (row for row in identified if row["scenario"] == "nominal" and int(row["seeds"]) > 1)
+    lines = [[f"Pearson r, median of {nominal['seeds']} seeds", f"{float(nominal['pearson_r']):.4f}", _PAPER["r"]]]
+    for policy in ("uncompensated", "input"):
+        lines.append([f"link error at rest, `{policy}`", f"{_range(cells, policy)} mrad", _PAPER[policy]])
+    return markdown_table(["figure", "here", "paper"], ["---", *_figures(2)], lines) + "\n"
+
+
+def _range(cells: Cells, policy: str) -> str:
+    row = cells.row(policy, "hold", "nominal")
+    return " to ".join(minus(f"{scaled(row, metric):+.1f}") for metric in _AT_REST)
+
+
+def identification(rows: Rows) -> str:
+    """Stiffness, friction and dead band that the static experiment finds, and how often the interval is right."""
+    lines = []
+    for row in rows:
+        if _is_of_damping(row):
+            continue
+        seeds, low, high = int(row["seeds"]), float(row["identified_min"]), float(row["identified_max"])
+        found = f"{float(row['identified_median']):.1f}" + (f" ({low:.1f} to {high:.1f})" if seeds > 1 else "")
+        scenario = f"`{row['scenario']}`, {seeds} seeds" if seeds > 1 else f"`{row['scenario']}`"
+        line, friction = f"{float(row['line_stiffness_nm_per_rad']):.1f}", f"{float(row['friction_nm']):.2f}"
+        truth, band = f"{float(row['stiffness_nm_per_rad']):g}", f"{1e3 * float(row['dead_band_rad']):.2f}"
+        lines.append([scenario, truth, found, line, friction, band])
+    head = ["scenario", "true K [N·m/rad]", "identified K", "plain line", "friction [N·m]", "dead band [mrad]"]
+    (nominal,) = (row for row in rows if row["scenario"] == "nominal" and not _is_of_damping(row))
+    return (
+        f"{markdown_table(head, ['---', *_figures(5)], lines)}\n\n"
+        f"In `nominal` the 95 % interval holds the true K in {nominal['covered']} of {nominal['seeds']} seeds. Its "
+        f"half-width is at most {100 * float(nominal['half_width_most']):.2f} %.\n"
+    )
+
+
+def _is_of_damping(row: Mapping[str, str]) -> bool:
+    return row["scenario"] == "nominal" and row["seeds"] == "1"
+
+
+def output_compensators(rows: Rows) -> str:
+    """Error of Eq. 12 against Newton's method on Eq. 10."""
+    angles = {"deflection_peak_rad": "3g", "error_rms_rad": "2g", "error_peak_rad": "2g"}
+    lines = [
+        [
+            f"{float(row['stiffness_nm_per_rad']):g}",
+            *(f"{1e3 * float(row[name]):.{form}}" for name, form in angles.items()),
+        ]
+        for row in rows
+    ]
+    head = ["K [N·m/rad]", "largest deflection [mrad]", "error of Eq. 12 against Newton, rms [mrad]", "largest [mrad]"]
+    return markdown_table(head, _figures(4), lines) + "\n"
+
+
+def damping(rows: Rows, identified: Rows) -> str:
+    """What the damping of the transmission changes: the identification, the errors at rest and those in motion."""
+    cells, lines = Cells(rows), []
+    for row in identified:
+        if not _is_of_damping(row):
+            continue
+        d = f"{float(row['damping_nms_per_rad']):g}"
+        motion = (scaled(cells.row(f"{policy}: {d}", "sine", "nominal"), ERROR)
+                  for policy in ("uncompensated", "input", "dynamic", "oracle"))  # fmt: skip
+        lines.append(
+            [d, f"{float(row['identified_median']):.1f}", f"{float(row['friction_nm']):.2f}",
+             f"{float(row['pearson_r']):.3f}", _range(cells, f"uncompensated: {d}"), _range(cells, f"input: {d}"),
+             ", ".join(f"{value:.1f}" for value in motion)]
+        )  # fmt: skip
+    head = [
+        "D [N·m·s/rad]", "identified K", "friction [N·m]", "r", "error at rest, uncompensated [mrad]", "`input` [mrad]",
+        "sine rms: uncompensated, input, dynamic, oracle [mrad]",
+    ]  # fmt: skip
+    return markdown_table(head, _figures(7), lines) + "\n"
+
+
+def scenarios(rows: Rows) -> str:
+    """Link error of every policy in every motion and scenario."""
+    return _link_errors(Cells(rows), ("uncompensated", "input", "dynamic", "oracle"))
+
+
+def rivals(rows: Rows) -> str:
+    """Link error of the policies that know or observe the friction."""
+    return _link_errors(Cells(rows), _RIVALS)
+
+
+def _link_errors(cells: Cells, policies: Sequence[str]) -> str:
+    lines = []
+    for reference in cells.names("reference"):
+        for scenario in cells.names("scenario"):
+            own = [_rms(cells, policy, reference, scenario) for policy in policies]
+            if any(figure != _NOT_PLAYED for figure in own):
+                lines.append([reference, f"`{scenario}`", *own])
+    head = ["reference", "scenario", *(f"`{policy}`" for policy in policies)]
+    return markdown_table(head, ["---"] * 2 + _figures(len(policies)), lines) + "\n"
+
+
+def _rms(cells: Cells, policy: str, reference: str, scenario: str) -> str:
+    """Three digits."""
+    if not cells.has(policy, reference, scenario):
+        return _NOT_PLAYED
+    row = cells.row(policy, reference, scenario)
+    if failed(row)[0]:
+        return "{} of {} failed".format(*failed(row))
+    value = scaled(row, ERROR)
+    return f"{value:.{1 if value >= 9.995 else 2}f}"

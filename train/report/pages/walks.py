@@ -1,0 +1,183 @@
+"""Tables of the walker's page, from the kept cells of comparisons."""
+
+from collections.abc import Mapping, Sequence
+
+from train.evaluate.leaderboard import Standing
+from train.report.pages.cells import Cells, Rows, failed, minus, scaled, shown
+from train.runs.escaping import markdown_table
+
+PELVIS, ZMP = "pelvis_error_rms_rad", "zmp_deviation_rms_m"
+
+_ROLL, _PITCH = (tuple(f"pelvis_{axis}_{kind}_rad" for kind in ("rms", "peak")) for axis in ("roll", "pitch"))
+_ZMPS = (ZMP, "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
+_EARLY, _FRAME, _JUMP = "early_touchdown_mean_s", "frame_error_mean_m", "com_jump_mean_m"
+_LARGE = 19.95
+"""From here on a figure has no decimal."""
+_NEVER_SHOWN = ("zero", "uncompensated_open")
+_FAST = ("uncompensated", "input_output", "input_wrench", "dynamic", "oracle")
+_PUBLISHED, _MIXTURE = ("uncompensated", "talos", "thormang"), ("nominal", "soft", "spread", "payload", "sensor")
+
+
+def _figures(count: int) -> list[str]:
+    return ["---:"] * count
+
+
+def all_scenarios(rows: Rows) -> str:
+    """Pelvis error and ZMP deviation of every policy in every scenario, a table per step period."""
+    cells = Cells(rows)
+    policies = [policy for policy in cells.names("policy") if policy not in _NEVER_SHOWN]
+    tables = []
+    for reference in cells.names("reference"):
+        lines = [
+            [f"`{scenario}`", *(_walk(cells.row(policy, reference, scenario)) for policy in policies)]
+            for scenario in cells.names("scenario")
+        ]
+        head = [reference, *(f"`{policy}`" for policy in policies)]
+        tables.append(markdown_table(head, ["---", *_figures(len(policies))], lines))
+    return "\n\n".join(tables) + "\n"
+
+
+def _walk(row: Mapping[str, str]) -> str:
+    fell, episodes = failed(row)
+    if fell == episodes:
+        return "fell"
+    text = f"{scaled(row, PELVIS):.1f}, {scaled(row, ZMP):.0f}"
+    return f"{text} ({fell}/{episodes} fell)" if fell else text
+
+
+def paper_walks(rows: Rows, others: Rows) -> str:
+    """Roll, pitch, ZMP deviation and early touch-down of every baseline in the gaits of the paper and faster."""
+    cells, fast = Cells(rows), Cells(others)
+    places = [
+        (cells, policy, reference, scenario) for reference in cells.names("reference")
+        for scenario in cells.names("scenario") for policy in cells.names("policy")
+        if cells.has(policy, reference, scenario)
+    ]  # fmt: skip
+    places += [(fast, policy, reference, "ideal") for reference in ("1.6 s", "1.1 s") for policy in _FAST]
+    lines = [
+        [reference, f"`{scenario}`", _robot(policy), *_paper_walk(own.row(policy, reference, scenario))]
+        for own, policy, reference, scenario in places
+    ]
+    head = ["step", "scenario", "policy", "roll", "pitch", "ZMP", "early"]
+    return markdown_table(head, ["---"] * 3 + _figures(4), lines) + "\n"
+
+
+def _robot(policy: str) -> str:
+    return "rigid robot, `zero`" if policy == "rigid" else f"`{policy}`"
+
+
+def _paper_walk(row: Mapping[str, str]) -> list[str]:
+    fell, episodes = failed(row)
+    if fell == episodes:
+        return [f"{fell} of {episodes} fell" if episodes > 1 else "fell", *["–"] * 3]
+    angles = (f"{scaled(row, rms):.2f} / {scaled(row, peak):.1f}" for rms, peak in (_ROLL, _PITCH))
+    return [*angles, shown(row, _ZMPS, 1, ", "), shown(row, [_EARLY], 0)]
+
+
+def local_frame(rows: Rows) -> str:
+    """Error of the local frame, and jump of the estimated center of mass, at the support changes."""
+    cells, lines = Cells(rows), []
+    references = cells.names("reference")
+    for policy in cells.names("policy"):
+        found = [cells.row(policy, reference, "nominal") for reference in references]
+        if all(row[_FRAME] for row in found) and not policy.endswith("_open"):
+            lines.append([f"`{policy}`", *(shown(row, [m], 1) for m in (_FRAME, _JUMP) for row in found)])
+    head = ["", *(f"{what}, {reference}" for what in ("e", "jump") for reference in references)]
+    return markdown_table(head, ["---", *_figures(len(head) - 1)], lines) + "\n"
+
+
+def sensitivity(rows: Rows) -> str:
+    """What a change of robot, gait or controller does to the walk, with and without compensation."""
+    cells = Cells(rows)
+    changes = list(dict.fromkeys(policy.partition(": ")[2] for policy in cells.names("policy")))
+    columns = [
+        (policy, scenario) for scenario in cells.names("scenario") for policy in ("uncompensated", "input_output")
+    ]
+    lines = []
+    for change in changes:
+        places = [(f"{policy}: {change}", "3 s", scenario) for policy, scenario in columns]
+        lines.append([change, *(_sway(cells.row(*place)) if cells.has(*place) else "–" for place in places)])
+    head = ["", *(f"`{policy}`, `{scenario}`" for policy, scenario in columns)]
+    return markdown_table(head, ["---", *_figures(4)], lines) + "\n"
+
+
+def _sway(row: Mapping[str, str]) -> str:
+    """Roll rms / peak, pitch peak, lateral ZMP deviation rms."""
+    if failed(row)[0]:
+        return "fell"
+    peaks = (scaled(row, metric) for metric in (_ROLL[1], _PITCH[1], _ZMPS[2]))
+    return f"{scaled(row, _ROLL[0]):.1f} / " + ", ".join(f"{peak:.{0 if peak >= _LARGE else 1}f}" for peak in peaks)
+
+
+def gravity_torques(rows: Rows) -> str:
+    """Gravity torque of the stance leg by each reading of Eq. 4."""
+    meaning = {
+        "com": "contact at the ZMP, all links weigh", "ankle": "contact at the ankle axis",
+        "lumped": "and the legs weigh nothing, as in published code",
+    }  # fmt: skip
+    joints = ("hip_roll", "ankle_roll", "knee")
+    lines = []
+    for row in rows:
+        own = ([float(row[f"{place}_{joint}_nm"]) for joint in joints] for place in ("ankle", "inward"))
+        torques = (" / ".join(minus(f"{torque:.1f}").replace("−0.0", "0.0") for torque in leg) for leg in own)
+        lines.append([f"`{row['method']}`: {meaning[row['method']]}", *torques])
+    head = ["", "ZMP under the ankle: hip roll / ankle roll / knee", "ZMP 0.02 m inward"]
+    return markdown_table(head, ["---", *_figures(2)], lines) + "\n"
+
+
+def drawn_robots(rows: Rows) -> str:
+    """Mean, interquartile mean and worst tenth over drawn robots."""
+    found: dict[tuple[str, str], dict[str, Mapping[str, str]]] = {}
+    for row in rows:
+        found.setdefault((row["scenario"], row["policy"]), {})[row["metric"]] = row
+    lines = [
+        [f"`{scenario}`", "residual trained at 3 s" if policy == "residual" else f"`{policy}`",
+         *(" / ".join(f"{1e3 * float(own[metric][name]):.1f}" for name in ("mean", "interquartile_mean", "worst_tenth"))
+           for metric in (PELVIS, ZMP)), own[PELVIS]["failed"], own[PELVIS]["episodes"]]
+        for (scenario, policy), own in found.items()
+    ]  # fmt: skip
+    head = ["scenario", "policy", "pelvis error", "ZMP deviation", "falls", "robots"]
+    return markdown_table(head, ["---"] * 2 + _figures(4), lines) + "\n"
+
+
+def imu_errors(rows: Rows) -> str:
+    """Pelvis error, ZMP deviation and error of the IMU without and with the errors of the device."""
+    cells = Cells(rows)
+    metrics = (PELVIS, ZMP, "imu_error_rms_rad")
+    lines = []
+    for policy in cells.names("policy"):
+        own = [cells.row(policy, "3 s", scenario) for scenario in ("nominal", "imu")]
+        lines.append([f"`{policy}`", *(shown(row, metrics, 2) for row in own), str(sum(failed(row)[0] for row in own))])
+    head = ["policy", "`nominal`: pelvis / ZMP / IMU", "`imu`: pelvis / ZMP / IMU", "falls"]
+    return markdown_table(head, ["---", *_figures(3)], lines) + "\n"
+
+
+def published_controllers(standings: Sequence[Standing]) -> str:
+    """What two teams published for their robots, beside no compensation."""
+    found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s"}
+    lines = [
+        [f"`{policy}`", *(_mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)]) for scope in _MIXTURE)]
+        for policy in _PUBLISHED
+    ]
+    head = ["policy", *(f"`{scope}`" for scope in _MIXTURE)]
+    return markdown_table(head, ["---", *_figures(len(_MIXTURE))], lines) + "\n"
+
+
+def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
+    """What `iterative` learns on each robot, beside its base."""
+    found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s" and not s.is_group}
+    scopes = [scope for policy, scope, metric in found if (policy, metric) == ("iterative", PELVIS)]
+    lines = [
+        [f"`{scope}`", *(_mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)], 2)
+                         for policy in ("adaptive_posture", "iterative"))]
+        for scope in scopes
+    ]  # fmt: skip
+    return markdown_table(["scenario", "without learning", "after ten walks"], ["---", *_figures(2)], lines) + "\n"
+
+
+def _mean(pair: Sequence[Standing], decimals: int = 1) -> str:
+    """Pelvis error in mrad with some decimals, and ZMP deviation in mm."""
+    pelvis, zmp = pair
+    if pelvis.failed == pelvis.episodes:
+        return "all fall"
+    return f"{1e3 * pelvis.score.value:.{decimals}f} / {1e3 * zmp.score.value:.1f}"
