@@ -30,8 +30,9 @@ help: ## Show this text
 demo: $(STAMP) ## Testbed and walker end to end: identify the spring, compensate it, show tables and figures
 	$(BIN)/elastic demo
 
+# logical: with psutil, which dask brings, "auto" would take one worker for two threads of a core
 test: $(STAMP) ## Run the tests, without network or display
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -n logical --maxprocesses 8 --dist worksteal $(ARGS)
 
 lint: $(STAMP) ## Check style, format and types; changes nothing
 	$(BIN)/ruff check .

@@ -100,7 +100,7 @@ def test_the_commands_judge_by_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "name: arm\nenv: handed.py:ARM\nreferences: [{kind: sine, amplitude: 0.3, duration_s: 1.0, onset_s: 0.5}]\n"
         "scenarios: [ideal]\npolicies: [uncompensated, dynamic]\n"
     )
-    main(["compare", "arm.yaml"])
+    main(["compare", "arm.yaml", "--jobs", "1"])
     folder = tmp_path / "runs" / "arm"
     without, compensated = csv.DictReader((folder / "episodes.csv").open())
     assert 1e-3 < float(without["end_effector_error_rms_m"]) < 0.1

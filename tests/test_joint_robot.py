@@ -141,7 +141,7 @@ def test_the_commands_play_and_compare_it(tmp_path: Path, monkeypatch: pytest.Mo
         f"name: arm\nenv: arm.py:ARM\nreferences: [{reference}]\nscenarios: [nominal, soft]\n"
         "policies: [uncompensated, input, dynamic]\n"
     )
-    main(["compare", "arm.yaml"])
+    main(["compare", "arm.yaml", "--jobs", "1"])
     folder = tmp_path / "runs" / "arm"
     rows = list(csv.DictReader((folder / "episodes.csv").open()))
     assert len(rows) == 6

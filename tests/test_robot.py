@@ -231,7 +231,7 @@ def test_the_commands_play_a_robot_from_its_file(tmp_path: Path, monkeypatch: py
         f"name: both\nenv: mine/arm.robot.yaml\nreferences: [{motion}]\nscenarios: [ideal]\n"
         "policies: [uncompensated, input]\n"
     )
-    main(["compare", "both.yaml"])
+    main(["compare", "both.yaml", "--jobs", "1"])
     assert "end effector error" in (tmp_path / "runs" / "both" / "report.html").read_text()
     (tmp_path / "no.yaml").write_text("name: no\n")
     from train.evaluate.environments import environment

@@ -24,6 +24,7 @@ import train.evaluate.evaluate
 import train.experiments.compare
 import train.experiments.demo
 import train.report.summary
+import train.speed.contenders
 import train.speed.speed
 from baselines.identification.identify import Identification
 from elastic_env.core.config import load_yaml
@@ -610,8 +611,9 @@ def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture
     assert "runs/speed/speed.json" in capsys.readouterr().out
 
 
-def test_speed_of_learning_end_to_end() -> None:
+def test_speed_of_learning_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a PPO that collects in one place and is timed in another."""
+    monkeypatch.setattr(train.speed.contenders, "PPO_DECISIONS", 32)
     main([*SPEED, "--env", "testbed", "--num-envs", "2", "--no-others"])
     ours, processes = json.loads(Path("runs/speed/speed.json").read_text())[-2:]
     assert (ours["contender"], ours["num_envs"]) == ("PPO with input, vector env", 64)

@@ -437,7 +437,7 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
         "figure_policies": ["input", "rigid"],
     }  # fmt: skip
     Path("walks.yaml").write_text(yaml.safe_dump(content))
-    main(["compare", "walks.yaml"])
+    main(["compare", "walks.yaml", "--jobs", "1"])
     assert drawn == [["input", "rigid"]] * 2
     stem = "0.3+0.5+0.3_s_num_steps=1_ideal.png"
     reports = {"statistics.csv", "report.html", "report.md"}

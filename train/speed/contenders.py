@@ -21,6 +21,8 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import blamed, make_policy, make_vector_env
 
+PPO_DECISIONS = 512
+"""Decisions that PPO collects before it learns from them."""
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -222,7 +224,7 @@ class PPOLoop(Contender):
             venv = SB3VecEnv(ResidualVectorWrapper(inner, policy, {acts_on: None}))
         self._period = ResidualSettings().decision_period
         torch.set_num_threads(1)
-        self._rollout = max(512 // num_envs, 8)
+        self._rollout = max(PPO_DECISIONS // num_envs, 8)
         self._model = PPO(
             "MlpPolicy", venv, n_steps=self._rollout, batch_size=512, n_epochs=10, gamma=0.95, device="cpu",
             policy_kwargs={"net_arch": [64, 64]},
@@ -231,7 +233,7 @@ class PPOLoop(Contender):
         self.env = self._model.get_env()
 
     def run(self, steps: int) -> float:  # noqa: ARG002  a whole iteration is the least there is
-        """See `Contender`: one iteration of 512 decisions."""
+        """See `Contender`: one iteration of `PPO_DECISIONS`, or of 8 in each world."""
         before, begin = self._model.num_timesteps, time.perf_counter()
         self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
         return (self._model.num_timesteps - before) * self._period / (time.perf_counter() - begin)
