@@ -271,3 +271,20 @@ def test_a_residual_is_trained_on_a_robot_of_ones_own_and_compared(
     assert "held out" in table
     with pytest.raises(ConfigurationError, match=f"is a residual for the {name}, the environment is the testbed"):
         baselines.make("residual:runs/learned/seed_0/last", gymnasium.make("elastic_env/Testbed-v0"))
+
+
+def test_link_encoders_tell_the_stiffness_of_every_joint() -> None:
+    """Catches an estimate that mixes joints up or does not reach the command: the true K is the judge."""
+    env = scalar(scenario="ideal+spread", sensors=["link_encoder"], timestep_s=0.001)
+    policy, state, done, info = baselines.make("link_encoder", env), None, False, {}
+    observation, _ = env.reset(seed=0)
+    factor = env.unwrapped.truth().stiffness[0] / env.unwrapped.assumed_model.stiffness
+    while not done:
+        action, state = policy.predict(observation, state)
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+    correction = 1.0 + state[0][0, 5:9]
+    np.testing.assert_allclose(correction[1:3], 1.0 / factor[1:3], rtol=0.02)
+    np.testing.assert_allclose(policy.link_estimate(observation, state), env.unwrapped.truth().q[0], atol=1e-3)
+    fixed = metrics_of(scalar(scenario="ideal+spread", timestep_s=0.001), "dynamic")["end_effector_error_rms_m"]
+    assert info["episode_metrics"]["end_effector_error_rms_m"] < 0.5 * fixed
