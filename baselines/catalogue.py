@@ -14,6 +14,7 @@ from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObser
 from baselines.adaptation.estimators import EncoderEstimator, LegEstimator
 from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
+from baselines.adaptation.link_sensors import LinkEncoderEstimator
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import Compensator, DynamicCompensator, GravityCompensator, OutputMethod
@@ -156,6 +157,14 @@ def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     return build
 
 
+def _link_encoder(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
+    """`dynamic`, with links by their encoders and the stiffness of every joint adapted by them."""
+    sensors = DeflectionSensors(model, LINK_ENCODER)
+    modelled = DynamicCompensator(model, options.output or "taylor", options.gravity)
+    policy = Compensated(_zero(env, model, options), MeasuredCompensator(modelled, sensors), options.ramp_s)
+    return OnlineStiffness(policy, model, LinkEncoderEstimator(model, sensors), options.adaptation)
+
+
 def _thormang(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:  # noqa: ARG001
     balance = FootBalance(model, options.foot_balance, options.ramp_s)
     return StanceRoll(balance, model, options.stance_roll)
@@ -192,6 +201,7 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
     "disturbance_observer": NamedPolicy(
         _disturbance_observer, (*_COMPENSATOR, "observer"), Track.LINK_ENCODERS, (LINK_IMU,)
     ),
+    "link_encoder": NamedPolicy(_link_encoder, (*_COMPENSATOR, "adaptation"), Track.LINK_ENCODERS, (LINK_ENCODER,)),
     "iterative": NamedPolicy(_iterative, (*_COMPENSATOR, *_LEARNED), Track.WALKS),
     "oracle": NamedPolicy(_oracle, ("ramp_s",), Track.TRUTH),
 }

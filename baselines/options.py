@@ -36,7 +36,7 @@ class PolicyOptions(Model):
     base: str = "input_output"
     """Walker: the compensated policy that `adaptive`, `posture` and `adaptive_posture` build on."""
     adaptation: AdaptationGains = AdaptationGains()
-    """Walker: how fast the stiffness is adapted."""
+    """How fast the stiffness is adapted."""
     posture: PostureGains = PostureGains()
     """Walker: gains of the posture feedback."""
     stance_roll: StanceRollGains = StanceRollGains()

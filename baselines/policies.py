@@ -79,7 +79,8 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | `posture` | - | `input_output` with the pelvis' attitude fed back to the hips |
     | `adaptive_posture` | - | both: the strongest with the standard sensors |
     | `torque_sensor` | - | deflections by joint torque sensors, K⁻¹ τ_J |
-    | `hip_sensor`, `link_encoder` | - | deflections by link encoders, at the hips or at all joints |
+    | `link_encoder` | `dynamic`, the K of each joint adapted by link encoders | deflections by link encoders |
+    | `hip_sensor` | - | the same at the hips alone |
     | `thormang` | - | what this robot's published controller does: hip roll in single support, feet by IMU and wrench |
     | `talos` | - | the controller, its hip rolls led by their measured torque, as TALOS' published one does |
     | `iterative` | `input`, offsets learned on this robot before | `adaptive_posture`, likewise: see below |

@@ -64,6 +64,32 @@ def test_at_rest_the_links_hang_where_gravity_and_springs_have_them() -> None:
     np.testing.assert_array_equal(observation[encoder], truth.theta[0])
 
 
+def test_a_spread_gives_every_joint_of_every_robot_a_stiffness_of_its_own() -> None:
+    """Catches springs that stay as they were, or as another world has them: MuJoCo's gravity at rest is the judge."""
+    worlds = vector(4, scenario="ideal+spread", reference=STILL, autoreset_mode="SameStep")
+    model = rigid_arm().compile()
+    data, seen = mujoco.MjData(model), []
+    worlds.reset(seed=0)
+    for _ in range(2):  # the second episodes have robots of their own
+        for _ in range(400):
+            worlds.step(np.zeros((4, 3), dtype=np.float32))
+        truth = worlds.unwrapped.truth()
+        for q, delta, stiffness in zip(truth.q, truth.deflection, truth.stiffness, strict=True):
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            np.testing.assert_allclose(stiffness * delta, data.qfrc_bias, atol=2e-3)
+        seen.append(truth.stiffness)
+        for _ in range(worlds.unwrapped.task.num_steps - 400):
+            worlds.step(np.zeros((4, 3), dtype=np.float32))
+    factors = np.concatenate(seen).ravel() / 400.0
+    assert len(np.unique(factors)) == len(factors)
+    assert 0.7 < factors.min() < 0.85
+    assert 1.15 < factors.max() < 1.3
+    again = scalar(scenario="ideal+spread", reference=STILL)
+    again.reset(seed=2)
+    np.testing.assert_array_equal(again.unwrapped.truth().stiffness[0], seen[0][2])
+
+
 def test_what_a_model_knows_a_compensator_takes_away() -> None:
     """Catches a compensator that is of one joint: by the true model little is left, by a wrong one what it misses."""
     without, statics, dynamics = (link_error(name, scenario="ideal") for name in ("uncompensated", "input", "dynamic"))

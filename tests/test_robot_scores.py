@@ -209,7 +209,7 @@ def test_other_ranges_than_those_of_training_are_held_out(
     monkeypatch: pytest.MonkeyPatch, trained: dict[str, Any], played: dict[str, Any], is_held_out: bool
 ) -> None:
     """Catches a robot beyond the trained ranges under the name of the trained scenario."""
-    known = Origin(("drawn",), "walker", None, (), (), (), trained)
+    known = Origin(("drawn",), None, (), (), (), trained)
     monkeypatch.setattr("train.evaluate.changes.families", lambda _: {"learned": known})
     cells = [cell("base", {"all": [1.0] * 4}, "drawn"), *family([[1.0] * 4], "drawn")]
     for e in cells:

@@ -687,7 +687,7 @@ def test_an_unstable_plant_diverges_by_itself() -> None:
         ({"scenario": "nominl"}, r"unknown scenario 'nominl'; choose one of: ideal, nominal, soft, .*'nominal'"),
         (
             {"scenario": "ideal+sof"},
-            r"unknown scenario 'sof'; choose one of: ideal, nominal, soft, stiff, payload, backlash",
+            r"unknown scenario 'sof'; choose one of: ideal, nominal, soft, stiff, spread, payload, backlash",
         ),
         ({"scenario": ""}, r"unknown scenario ''; choose one of: ideal"),
         ({"scenario": "soft+ideal"}, r"'soft\+ideal': 'ideal' is a ground and can only stand first"),

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, Parameter
 from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
@@ -159,7 +159,7 @@ class JointRobot:
         return JointPlant(
             name=self.name, model=self.elastic(config).compile(), assumed=assumed, true=true,
             static_torque=body.gravity_torque, motion=motion,
-            rest_angle=partial(_rest_angle, stiffness=true.rest_stiffness(config.form), true=true, body=body),
+            rest_angle=partial(_rest_angle, form=config.form, true=true, body=body),
             end_effector=tool,
         )  # fmt: skip
 
@@ -325,8 +325,9 @@ def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> 
             )
 
 
-def _rest_angle(command: Array, stiffness: Array, true: RobotModel, body: TreeTorque) -> Array:
+def _rest_angle(command: Array, factor: Parameter = 1.0, *, form: str, true: RobotModel, body: TreeTorque) -> Array:
     """Link angles at rest without friction: a dead band is crossed to the side to which the load pulls."""
+    stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return command
     engaged = command - np.sign(body.gravity_torque(command)) * true.backlash / 2.0

@@ -6,6 +6,7 @@ asked for; the action is the command offset of every joint. With one joint its s
 the deflections, of the servo errors and of the offsets' rates, largest joint torque.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, S
 from elastic_env.core.state import Stateful
 from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.joint.elasticity import joint_torque
-from elastic_env.joint.joint_names import JointAddresses, servo_name
+from elastic_env.joint.joint_names import JointAddresses, servo_name, spring_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
 from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
@@ -28,6 +29,7 @@ from elastic_env.runtime.joint_config import JointConfig
 from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.runtime.scenario import Scenario
 from elastic_env.runtime.sensors import NoiseStream, PendulumImu, attitude, is_due, quantise
 from elastic_env.runtime.task import Outcome
 
@@ -77,7 +79,8 @@ class JointPlant:
         model: Compiled, with elastic joints.
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
-        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad].
+        rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad], and if they differ
+            from the true ones the springs' factors, (..., n) [1].
         motion: The reference as all joints follow it.
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
             q = 0 [m]; None where there is no such IMU.
@@ -89,7 +92,7 @@ class JointPlant:
     assumed: RobotModel
     true: RobotModel
     static_torque: Callable[[Array], Array]
-    rest_angle: Callable[[Array], Array]
+    rest_angle: Callable[..., Array]
     motion: Planned
     imu_arm_m: float | None = None
     end_effector: EndEffector | None = None
@@ -150,6 +153,7 @@ class JointSample(Rows):
         imu: Link angles as IMUs show them, (rows, n) [rad].
         servo_error: θ_cmd − θ, (rows, n) [rad].
         command_rate: Rate of change of the offsets, (rows, n) [rad/s].
+        stiffness: True K, (rows, n) [N·m/rad].
         diverged: Whether the world has no new state, (rows,).
     """
 
@@ -161,6 +165,7 @@ class JointSample(Rows):
     imu: Array
     servo_error: Array
     command_rate: Array
+    stiffness: Array
     diverged: BoolArray
 
 
@@ -224,6 +229,7 @@ class JointTask(Stateful):
     STATE = (
         "_reference", "_noise", "_sensors", "_step", "_present", "_coming", "_state", "_measured", "_shown",
         "_encoder_bias", "_imu_bias", "_imu", "_offset", "_offset_before", "_command", "_diverged", "_force",
+        "_factor", "_stiffness",
     )  # fmt: skip
 
     failure_names: tuple[str, ...] = ()  # what stands on a fixed base cannot fall over
@@ -252,7 +258,7 @@ class JointTask(Stateful):
         self.observation_table = SignalTable(tuple(observed))
         self.assumed_model = plant.assumed.observed_by(self.observation_table)
         self._true_model = plant.true.observed_by(self.observation_table)
-        require_stable(self.model, config.control_period_s)
+        require_stable(stiffest(plant.model, config.scenario), config.control_period_s)
         self._at = JointAddresses.of(self.model, joints)
         servos = [self.model.actuator(servo_name(joint)) for joint in joints]
         self._inputs = np.array([servo.id for servo in servos])
@@ -266,6 +272,9 @@ class JointTask(Stateful):
         self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds, n))
         self._offset, self._offset_before, self._command = np.zeros((3, num_worlds, n))
         self._diverged, self._force = np.zeros(num_worlds, dtype=np.bool_), np.full((num_worlds, 3), np.nan)
+        self._factor = np.ones((num_worlds, n))
+        self._stiffness = np.broadcast_to(self._true_model.stiffness, (num_worlds, n))
+        self._springs = np.array([self.model.tendon(spring_name(joint)).id for joint in self._spread_joints()])
 
     @property
     def num_steps(self) -> int:
@@ -283,6 +292,8 @@ class JointTask(Stateful):
             self._noise.restart(world, draws[world].noise())
             if self._imu is not None:
                 self._imu_bias[world] += self._imu.draw(world, generator, draws[world].noise())
+        if scenario.stiffness_spread > 0.0:
+            self._spread(simulation, worlds, draws)
         self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
         self._follow()
         self._offset[worlds] = self._offset_before[worlds] = 0.0
@@ -347,7 +358,7 @@ class JointTask(Stateful):
         command_rate = (self._offset - self._offset_before) / self.config.control_period_s
         return JointSample(
             self._step, reference.q, reference.scored, reference.rest, self._state, self._shown.imu, servo_error,
-            command_rate, self._diverged,
+            command_rate, self._stiffness, self._diverged,
         )  # fmt: skip
 
     def signals(self, sample: JointSample) -> Signals:
@@ -361,7 +372,7 @@ class JointTask(Stateful):
             "link_error": sample.q_ref - state.q,
             "link_error_imu": sample.q_ref - sample.imu,
             "deflection": deflection,
-            "joint_torque": self._joint_torque(deflection, state.theta_dot - state.q_dot),
+            "joint_torque": self._joint_torque(deflection, state.theta_dot - state.q_dot, sample.stiffness),
             "servo_error": sample.servo_error,
             "command_rate": sample.command_rate,
         }
@@ -411,18 +422,32 @@ class JointTask(Stateful):
         """State without noise, and the true parameters."""
         state = self._state
         deflection = state.theta - state.q
-        torque = self._joint_torque(deflection, state.theta_dot - state.q_dot)
-        stiffness = np.broadcast_to(self._true_model.stiffness, torque.shape)
-        values = (state.q, torque, self._force, state.theta, state.theta_dot, state.q_dot, deflection, stiffness)
+        torque = self._joint_torque(deflection, state.theta_dot - state.q_dot, self._stiffness)
+        values = (state.q, torque, self._force, state.theta, state.theta_dot, state.q_dot, deflection, self._stiffness)
         return JointTruth(*(value.copy() for value in values), model=self._true_model)
 
-    def _joint_torque(self, deflection: Array, deflection_rate: Array) -> Array:
+    def _joint_torque(self, deflection: Array, deflection_rate: Array, stiffness: Array) -> Array:
         model = self._true_model
-        return joint_torque(deflection, deflection_rate, model.stiffness, model.damping, model.backlash)
+        return joint_torque(deflection, deflection_rate, stiffness, model.damping, model.backlash)
+
+    def _spread_joints(self) -> Sequence[str]:
+        """Joints whose springs differ from world to world."""
+        return self._joints if self.config.scenario.stiffness_spread > 0.0 and self.config.form == "tendon" else ()
+
+    def _spread(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
+        """Draw a factor on K for every joint of new robots, and give it to the springs."""
+        width, factor = self.config.scenario.stiffness_spread, self._factor.copy()
+        for world in np.flatnonzero(worlds).tolist():
+            factor[world] = 1.0 + width * draws[world].robot.uniform(-1.0, 1.0, len(self._joints))
+        # samples keep the array that they were taken with
+        self._factor, self._stiffness = factor, factor * self._true_model.stiffness
+        if len(self._springs):
+            each = np.ix_(worlds, self._springs)
+            simulation.vary("tendon_stiffness")[each] = factor[worlds] * self.model.tendon_stiffness[self._springs]
 
     def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
         command = (self._command - self._encoder_bias)[worlds]
-        q = self._plant.rest_angle(command)
+        q = self._plant.rest_angle(command, self._factor[worlds])
         torque = self._plant.static_torque(q)
         theta = command - self._true_model.servo_compliance * torque
         simulation.qpos[np.ix_(worlds, self._at.theta)] = theta
@@ -465,6 +490,15 @@ class JointTask(Stateful):
         if self._imu is None:
             return attitude(imu, self._state.q, self._imu_bias, noise)
         return attitude(imu, self._imu.angle[:, None], self._imu_bias, np.zeros_like(noise))
+
+
+def stiffest(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
+    """A model with the stiffest springs that a scenario draws; all tendons with stiffness count as springs."""
+    if scenario.stiffness_spread == 0.0:
+        return model
+    stiff = copy.copy(model)
+    stiff.tendon_stiffness[:] *= 1.0 + scenario.stiffness_spread
+    return stiff
 
 
 def _inertial_imu(config: JointConfig, plant: JointPlant, num_worlds: int) -> PendulumImu | None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from elastic_env.core.config import plain_numbers
 from elastic_env.core.errors import ConfigurationError, shown
-from elastic_env.core.signals import NO_SIGNALS, Array, SignalTable
+from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
 from elastic_env.dynamics.biped import Biped
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.motion.walk_plan import WalkPlan
@@ -91,12 +91,21 @@ class RobotModel:
         servos = [joint.servo for joint in self.joints.values()]
         return np.array([0.0 if s is None or s.integral_gain > 0.0 else 1.0 / s.position_gain for s in servos])
 
-    def rest_stiffness(self, form: str) -> Array:
-        """Spring and servo in series, as a command at rest feels them, (n,) [N·m/rad]; infinite for what is rigid."""
-        springs = np.zeros(len(self.joints)) if form == "rigid" else 1.0 / self.stiffness
+    def rest_stiffness(self, form: str, factor: Parameter = 1.0) -> Array:
+        """Spring and servo in series, as a command at rest feels them; infinite for what is rigid.
+
+        Args:
+            form: "rigid" for a robot without springs.
+            factor: On K, one number or (..., n) [1].
+
+        Returns:
+            (n,) or (..., n) [N·m/rad].
+        """
+        stiffness = factor * self.stiffness
+        springs = np.zeros_like(stiffness) if form == "rigid" else 1.0 / stiffness
         with np.errstate(divide="ignore"):
             in_series = 1.0 / (springs + self.servo_compliance)
-        return np.where(self.servo_compliance > 0.0, in_series, np.inf if form == "rigid" else self.stiffness)
+        return np.where(self.servo_compliance > 0.0, in_series, np.inf if form == "rigid" else stiffness)
 
     def with_stiffness(self, stiffness: npt.ArrayLike) -> "RobotModel":
         """The same robot with another stiffness, one number for all joints or one per joint [N·m/rad].

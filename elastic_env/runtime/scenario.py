@@ -197,7 +197,7 @@ DISTRIBUTIONS: dict[str, ScenarioChange] = {
 quantity beyond these."""
 
 
-WALKER_FIELDS = ("stiffness_spread", "push_n", "slope_rad", "ranges")
+WALKER_FIELDS = ("push_n", "slope_rad", "ranges")
 """Parameters that only a robot that walks knows."""
 WALKER_ONLY = tuple(name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS})
 """Changes that set one of them."""

@@ -98,8 +98,8 @@ class Evaluate:
     """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in place),
     robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a JointRobot."""
     scenario: str | None = None
-    """Scenario, such as nominal (default), ideal, soft, stiff, payload, backlash,
-    sensor, ideal+soft; on the walker also spread, imu, push, slope, drawn, drawn_beyond."""
+    """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,
+    sensor, ideal+soft; on the walker also imu, push, slope, drawn, drawn_beyond."""
     reference: str | None = None
     """Motion. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some seconds),
     or a mapping such as '{kind: sine, amplitude: 0.3}'.

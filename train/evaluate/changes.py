@@ -12,7 +12,7 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
 from train.evaluate.conditions import Condition, Member
-from train.evaluate.environments import Column, Environment, environment
+from train.evaluate.environments import Column, Environment
 from train.evaluate.evaluate import Evaluation, grouped
 from train.evaluate.families import Origin, origin
 from train.evaluate.statistics import Estimate, change, improvement, over_seeds, pair
@@ -268,7 +268,7 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
     first = cells[0][0][0].condition
     known = first.environment
     scenarios = [_seen_as(ours[0].condition, trained) for ours, _ in cells]
-    marks = _marks(trained, _motion(known, first.reference), scenarios, first.swept)
+    marks = _marks(trained, known, _motion(known, first.reference), scenarios, first.swept)
     return [_row(scope, cells, column, marks, is_group) for column in (*known.judged, *known.also)]
 
 
@@ -310,14 +310,13 @@ def _mean(seeds: Sequence[Sequence[Array]]) -> float:
 
 
 def _marks(
-    trained: Origin | None, reference: str, scenarios: Sequence[str], swept: Mapping[str, float]
+    trained: Origin | None, known: Environment, reference: str, scenarios: Sequence[str], swept: Mapping[str, float]
 ) -> tuple[str, ...]:
     """What training has seen of a row's condition."""
     if trained is None:
         return ()
     if trained.scenarios is None:
         return ("training condition unknown",)
-    known = environment(trained.environment)
     motion: Any = known.default_reference if trained.reference is None else trained.reference
     seen = _motion(known, motion) == reference
     unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]

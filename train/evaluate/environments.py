@@ -94,6 +94,7 @@ class Environment:
 
     Attributes:
         id: Its name for `gymnasium.make`.
+        robot: Name of its task, under which trained policies are kept.
         motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
         default_reference: Reference where none is named.
         watched_reference: The same for a picture; None for the default.
@@ -123,6 +124,7 @@ class Environment:
     """
 
     id: str
+    robot: str
     motion: str
     default_reference: Reference
     arguments: Callable[[Reference], dict[str, Any]]
@@ -202,7 +204,7 @@ def _of_ones_own(name: str) -> Environment:
     if not isinstance(robot, JointRobot):
         raise ConfigurationError(f"{name} is no elastic_env.JointRobot but of type {type(robot).__name__}")
     robot.register()
-    return replace(_JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR, id=robot.id)
+    return replace(_JOINTS if robot.end_effector is None else _WITH_END_EFFECTOR, id=robot.id, robot=robot.name)
 
 
 def _kind(reference: Reference) -> str:
@@ -243,6 +245,7 @@ def _walk_abscissa(reference: Reference) -> dict[str, float]:
 
 _TESTBED = Environment(
     id=IDS["testbed"],
+    robot="testbed",
     motion="reference",
     default_reference="hold",
     arguments=lambda reference: {"reference": reference},
@@ -312,6 +315,7 @@ _ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_
 
 _WALKER = Environment(
     id=IDS["walker"],
+    robot="walker",
     motion="step_period",
     default_reference=3,
     arguments=_walk_arguments,
@@ -378,7 +382,7 @@ _HARDWARE = replace(
 
 _OWN = {
     "testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE,
-    "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"], default_reference="poses"),
+    "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"], robot="robot", default_reference="poses"),
 }  # fmt: skip
-ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known) for name, known in IDS.items()}
+ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known, robot=name) for name, known in IDS.items()}
 """Environments by their short names: those with figures of their own, and other robots of elastic joints."""

@@ -43,7 +43,6 @@ class Origin:
 
     Attributes:
         scenarios: That it was trained on; None where its files do not say.
-        environment: Short name of the environment.
         reference: Motion that it was trained on; None for the environment's default.
         missing_seeds: Training seeds of its configuration that the family does not have.
         folders: Its folders.
@@ -52,7 +51,6 @@ class Origin:
     """
 
     scenarios: tuple[str, ...] | None
-    environment: str
     reference: object
     missing_seeds: tuple[int, ...]
     folders: tuple[str, ...]
@@ -115,7 +113,6 @@ def origin(members: Sequence[Member]) -> Origin:
     wanted, had = set(config.seeds), {member.training_seed for member in members}
     return Origin(
         scenarios=None if scenarios is None else tuple(scenarios),
-        environment=descriptions[0].robot,
         reference=config.reference,
         missing_seeds=tuple(sorted(wanted - had)) if len(members) > 1 else (),
         folders=tuple(member.folder for member in members),

@@ -119,8 +119,8 @@ class TrainConfig(Model):
     def description(self, **network: Any) -> ResidualDescription:
         """What an exported policy says of itself; `network` names its activation and output."""
         return ResidualDescription(
-            robot=self.env, base=self.base, base_options=self.base_options, settings=self.settings, clip=self.clip,
-            **network,
+            robot=environment(self.env).robot, base=self.base, base_options=self.base_options, settings=self.settings,
+            clip=self.clip, **network,
         )  # fmt: skip
 
     def is_due(self, every: int, before: int, now: int) -> bool:

@@ -22,7 +22,7 @@ from elastic_env.robots.robot import ID, NAME
 from elastic_env.robots.robot.joints import GivenJoints, elastic_joints, home_of_joints, read_joints
 from elastic_env.robots.robot.model import GivenModel, RigidModel, read_robot
 from elastic_env.runtime.joint_config import RewardWeights
-from elastic_env.runtime.joint_task import JointTask
+from elastic_env.runtime.joint_task import JointTask, stiffest
 from elastic_env.runtime.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
@@ -88,8 +88,8 @@ def configure_robot(
     robot = replace(robot, home=_home(robot, home), imu=imu, **({} if load_kg is None else {"load_kg": load_kg}))
     settings = robot.configure(reference, scenario, stiffness, form, sensors, reward, timestep_s)
     if timestep_s is None:
-        model_played = compiled_spec(robot.elastic(settings), "the model with elastic joints")
-        settings = settings.replace(timestep_s=stable_timestep(model_played, settings.control_period_s))
+        played = stiffest(compiled_spec(robot.elastic(settings), "the model with elastic joints"), settings.scenario)
+        settings = settings.replace(timestep_s=stable_timestep(played, settings.control_period_s))
     return RobotConfig(robot=robot, **{name: getattr(settings, name) for name in type(settings).model_fields})
 
 

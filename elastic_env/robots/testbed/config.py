@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.motion.references import AboutHome
@@ -50,11 +50,10 @@ def plant(config: TestbedConfig) -> JointPlant:
     if ACCELEROMETER in config.sensors:
         add_accelerometer(spec, "imu")
     true = robot_model(joint, pendulum)
-    stiffness = true.rest_stiffness(config.form)
     return JointPlant(
         name=NAME, model=spec.compile(), assumed=robot_model(config.joint, config.pendulum),
         true=true, static_torque=pendulum.torque,
-        rest_angle=partial(_rest_angle, stiffness=stiffness, joint=joint, pendulum=pendulum),
+        rest_angle=partial(_rest_angle, form=config.form, true=true, pendulum=pendulum),
         motion=AboutHome(config.reference, np.zeros(1)), imu_arm_m=imu_arm(pendulum),
     )  # fmt: skip
 
@@ -78,10 +77,11 @@ def require_feasible(config: TestbedConfig) -> None:
     require_torque(config.reference, np.array([needed]), np.array([joint.servo.torque_limit]))
 
 
-def _rest_angle(theta: Array, stiffness: Array, joint: ElasticJoint, pendulum: Pendulum) -> Array:
+def _rest_angle(theta: Array, factor: Parameter = 1.0, *, form: str, true: RobotModel, pendulum: Pendulum) -> Array:
     """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
+    stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return theta
-    half = np.sign(theta) * joint.backlash / 2.0
+    half = np.sign(theta) * true.backlash / 2.0
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
     return static_link_angle(engaged, stiffness, pendulum.torque, pendulum.torque_gradient)
