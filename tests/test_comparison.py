@@ -510,7 +510,7 @@ def test_report_begins_with_three_sentences() -> None:
         for policy, values in (("base", [2.0, 4.0]), ("better", [1.0, None]))
     ]
     assert re.findall(r"<p>(.*?)</p>", report_of(cells))[0] == (
-        "2 policies played 8 episodes in 2 scenarios, of which 2 count as falls. "
+        "2 policies played 8 episodes in 2 scenarios, of which 2 failed. "
         "The lowest pelvis error rms is that of base, a mean of 3000.00 mrad. better comes last, with 1000.00 mrad."
     )
     few = [

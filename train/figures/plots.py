@@ -13,7 +13,7 @@ from train.evaluate.evaluate import Evaluation
 MRAD, MM = 1e3, 1e3
 """Factors from rad and m to what figures show."""
 
-_COLOURS = {
+COLOURS = {
     "zero": "#9c6644",
     "rigid": "#555555",
     "uncompensated_open": "#e6a57e",
@@ -25,7 +25,8 @@ _COLOURS = {
     "dynamic": "#7aa344",
     "oracle": "#8e5ea2",
 }
-_STRONG = ("#d6006c", "#e69500", "#3d3df5", "#00a63e", "#111111", "#00a5cf", "#a05a00", "#8a8a8a")
+"""Of the baselines."""
+STRONG = ("#d6006c", "#e69500", "#3d3df5", "#00a63e", "#111111", "#00a5cf", "#a05a00", "#8a8a8a")
 """Of residuals and of one's own policies: far from the baselines' and from one another."""
 FAILED = "#111111"
 """Colour of the mark of a failure that belongs to no policy alone."""
@@ -65,8 +66,8 @@ def require_matplotlib() -> Any:
 
 def colours(policies: Sequence[str]) -> dict[str, str]:
     """A colour for every policy of a comparison: those that have none of their own take the others in turn."""
-    unnamed = [policy for policy in policies if policy not in _COLOURS]
-    return {policy: _COLOURS.get(policy) or _STRONG[unnamed.index(policy) % len(_STRONG)] for policy in policies}
+    unnamed = [policy for policy in policies if policy not in COLOURS]
+    return {policy: COLOURS.get(policy) or STRONG[unnamed.index(policy) % len(STRONG)] for policy in policies}
 
 
 def line_style(policy: str) -> str:

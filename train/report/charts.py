@@ -11,6 +11,7 @@ from train.evaluate.evaluate import Evaluation
 from train.evaluate.statistics import Estimate
 from train.report.parts import (
     INK,
+    LINE,
     LONGEST_NAME,
     VERDICTS,
     Chart,
@@ -78,7 +79,7 @@ def ladder(lines: Lines, reference: str) -> Chart:
     ]
     layout["shapes"] = [
         {"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": place - 0.6, "y1": place - 0.6,
-         "line": {"color": "#d0d7de", "width": 1}}
+         "line": {"color": LINE, "width": 1}}
         for place, _ in headings[1:]
     ]  # fmt: skip
     layout["showlegend"] = False

@@ -14,6 +14,8 @@ from train.report.parts import (
     GRID,
     INK,
     LONGEST_NAME,
+    REFERENCE,
+    SHADE,
     Chart,
     Lines,
     Spec,
@@ -31,7 +33,6 @@ from train.report.parts import (
 )
 from train.runs.escaping import chart_text
 
-_SHADE = "#f1f3f5"
 _POINTS, _LEAST_POINTS, _ALL_POINTS = 600, 250, 6000
 """Most points of a line; the least of that and of all cells together, so that a large comparison stays small."""
 
@@ -56,7 +57,7 @@ def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:
         where = {**grid, "yaxis": f"y{axis}", "type": "scatter", "mode": "lines"}
         if signal.reference is not None:
             data.append({**where, "y": thinned(signal.scale * longest[signal.reference], stride), "name": "reference",
-                         "line": {"color": "#111111", "width": 1.2, "dash": "dash"}, "hoverinfo": "skip"})  # fmt: skip
+                         "line": {"color": REFERENCE, "width": 1.2, "dash": "dash"}, "hoverinfo": "skip"})  # fmt: skip
         for title, cell in cells.items():
             data += _curves(title, lines.colour[title], cell, signal, stride, where, first=number == 0)
         layout[f"yaxis{axis}"] = axis_of(
@@ -71,7 +72,7 @@ def over_time(lines: Lines, reference: str, scenario: str) -> Chart | None:
     if "single_support" in longest:
         layout["shapes"] = [
             {"type": "rect", "xref": "x", "yref": "paper", "x0": digits(begin), "x1": digits(end), "y0": 0, "y1": 1,
-             "fillcolor": _SHADE, "line": {"width": 0}, "layer": "below"}
+             "fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
             for begin, end in intervals(longest["single_support"], time)
         ]  # fmt: skip
     layout["margin"]["t"] = 28 + 20 * -(-sum(len(title) + 9 for title in cells) // 150)

@@ -8,7 +8,7 @@ import numpy as np
 from elastic_env.core.errors import missing_extra
 from train.evaluate.changes import CEILING, Change, percent_interval
 from train.report.changes_tables import falls
-from train.report.parts import FONT, INK, VERDICTS
+from train.report.parts import FONT, NIGHT, VERDICTS
 from train.runs.escaping import script_json
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def require_jinja2() -> "Template":
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     environment.filters.update(falls=falls, means=_means, percent=percent_interval, script_json=script_json)
-    environment.globals.update(ceiling=CEILING, font=FONT, ink=INK, verdicts=VERDICTS)
+    environment.globals.update(ceiling=CEILING, font=FONT, night=NIGHT, verdicts=VERDICTS)
     return environment.get_template("page.html.j2")
 
 

@@ -16,6 +16,15 @@ from train.figures.plots import colours
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
 INK, GRID, FRAME = "#1f2328", "#e8eaed", "#8b949e"
+LINE, SHADE, REFERENCE = "#d0d7de", "#f1f3f5", "#111111"
+"""Colours of a line between groups, of single support behind a curve, and of the reference."""
+NIGHT = {
+    "white": "#0d1117", INK: "#e6edf3", GRID: "#262c34", FRAME: "#4a525c", LINE: "#3d444d", SHADE: "#1c2128",
+    REFERENCE: "#e6edf3", "#1a7f5a": "#3fb27f", "#b42318": "#ff7b72", "#6e7781": "#9aa5b1", "#1f2a55": "#9fb0ff",
+    "#3d3df5": "#9d9dff", "#555555": "#a8a8a8", "#2a6f97": "#4c9bc9", "#8e5ea2": "#b184c6", "#d6006c": "#ff5aa5",
+    "#a05a00": "#d08a30",
+}  # fmt: skip
+"""Colours in the dark in place of those that would not be seen there, in all parts of a chart."""
 VERDICTS = {"lower": "#1a7f5a", "higher": "#b42318", "none": "#6e7781", "unclear": "#6e7781"}
 """Colours of what a row shows."""
 LONGEST_NAME = 34

@@ -109,7 +109,7 @@ def summary(results: Results) -> str:
     """Three sentences: what was played and what failed, who is best, and what learning adds, or who comes last."""
     played, lines = sum(len(e.episodes) for e in results.evaluations), results.lines
     failed = sum(e.num_failed for e in results.evaluations)
-    of_these = f"of which {failed} count as {lines.environment.failures}" if failed else "none of which failed"
+    of_these = f"of which {failed} failed" if failed else "none of which failed"
     first = (
         f"{_counted(len(lines.titles), 'policy', 'policies')} played {_counted(played, 'episode')} in "
         f"{_counted(len(lines.scenarios), 'scenario')}, {of_these}."

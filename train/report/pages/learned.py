@@ -7,13 +7,24 @@ from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import FEWEST_SEEDS, percent, percent_interval
+from train.evaluate.evaluate import grouped
 from train.evaluate.statistics import Estimate
+from train.report.pages.cells import Rows
 from train.runs.escaping import markdown_table
 
-_METRICS = {"pelvis_error_rms_rad": ("pelvis error", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm")}
+_METRICS = {
+    "pelvis_error_rms_rad": ("pelvis error", "mrad"), "pelvis_roll_rms_rad": ("roll", "mrad"),
+    "pelvis_pitch_rms_rad": ("pitch", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm"),
+    "link_error_rms_rad": ("link error", "mrad"),
+}  # fmt: skip
 """Metrics that pages show, with the unit of their tables."""
+_JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
+CEILINGS = ("pelvis_roll_rms_rad", "pelvis_pitch_rms_rad", "zmp_deviation_rms_m")
+"""Metrics of the residuals that are trained and scored on one walk."""
 MAPS = ("map_stiffness_imu", "map_payload_slope")
 """Configurations of the maps that pages show."""
+_SMALL = 2.0
+"""Below it an angle has two decimals [mrad]."""
 _SHOWN = ("lower", "higher")
 """Verdicts of a change that chance does not explain."""
 
@@ -89,25 +100,42 @@ def maps_markdown(maps: Iterable[LearnedMap]) -> str:
     return "\n".join(f"{each.sentence}\n\n{each.table}\n" for each in maps)
 
 
-def changes_table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Paired changes of a residual over its base in every scenario and group, from the rows of a `statistics.csv`."""
-    own = [row for row in rows if row["base_is"] == "base of the residual" and row["metric"] in _METRICS]
-    scopes = dict.fromkeys(row["scope"] for row in own)
+def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
+    """Paired changes of residuals over their bases in every scenario and group, from the rows of a `statistics.csv`.
+
+    Args:
+        rows: Its rows.
+        metrics: The metrics that are shown, where the table has them.
+    """
+    own = [row for row in rows if row["base_is"] == "base of the residual" and row["metric"] in metrics]
+    titles = {metric: _METRICS[metric] for metric in metrics if any(row["metric"] == metric for row in own)}
+    names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
     lines = []
-    for scope in scopes:
-        found = {row["metric"]: row for row in own if row["scope"] == scope}
-        cells = (part for metric, (_, unit) in _METRICS.items() for part in _over_base(found[metric], unit))
-        lines.append([f"**{scope}**" if found[next(iter(_METRICS))]["pooled"] == "True" else f"`{scope}`", *cells])
-    head = ["", *(text for title, unit in _METRICS.values() for text in (f"base: {title} [{unit}]", "change"))]
-    return markdown_table(head, ["---", *["---:"] * 4], lines) + "\n"
+    for place, found in grouped(own, lambda row: (*(row[name] for name in names), row["scope"])).items():
+        by_metric = {row["metric"]: row for row in found}
+        cells = (part for metric, (_, unit) in titles.items() for part in _over_base(by_metric[metric], unit))
+        lines.append([*place[:-1], _scope(found[0]), *cells])
+    head = [*names, "", *(text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change"))]
+    rules = ["---"] * (len(names) + 1) + ["---:"] * (2 * len(titles))
+    return markdown_table(head, rules, lines) + "\n"
+
+
+def _scope(row: Mapping[str, str]) -> str:
+    """A group in bold letters, or a scenario with its marks."""
+    if row["pooled"] == "True":
+        return f"**{row['scope']}**"
+    return f"`{row['scope']}`" + (f", {row['marks']}" if row["marks"] else "")
 
 
 def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
     """Mean of the base in mrad or mm, and the change with its interval; a star where chance explains it."""
+    if not row["change"]:
+        return f"falls, {row['base_failed']} of {row['base_episodes']}", "-"
     change, low, high = (float(row[name]) for name in ("change", "change_low", "change_high"))
     star = " *" if low <= 0.0 <= high or int(row["training_seeds"]) < FEWEST_SEEDS else ""
+    base = 1e3 * float(row["base_mean"])
     return (
-        f"{1e3 * float(row['base_mean']):.{2 if unit == 'mrad' else 1}f}",
+        f"{base:.{2 if unit == 'mrad' and base < _SMALL else 1}f}",
         f"{percent_interval(Estimate(change, low, high))}{star}",
     )
 

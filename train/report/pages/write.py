@@ -10,6 +10,7 @@ The tool writes all of them anew. A test fails where a page and the results disa
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
@@ -19,7 +20,7 @@ from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
 from train.report.pages import joints, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
-from train.report.pages.learned import MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
+from train.report.pages.learned import CEILINGS, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -34,7 +35,14 @@ _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 TABLES = {
     "demo_episodes": "copy it from runs/demo/episodes.csv after `elastic demo`",
     "gallery": "python -m train.experiments.gallery writes it",
-    "learned_posture": "copy it from statistics.csv after `elastic compare configs/learned_posture.yaml`",
+    **{
+        name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
+        for name in ("learned_posture", "learned_testbed", "learned_walker", "learned_walker_1600ms")
+    },
+    **dict.fromkeys(
+        ("learned_walker_bases", "learned_ceilings"),
+        "copy it from statistics.csv after the comparison in docs/learned.md of policies that you have trained",
+    ),
     "drawn_robots": "copy it from robots.csv after `elastic compare configs/drawn_robots.yaml`",
     **{
         kept.table or name: f"python -m train.report.pages.keep writes it from a run of configs/{name}.yaml"
@@ -163,6 +171,11 @@ PARTS: Mapping[str, Part] = {
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned posture": _of(changes_table, "learned_posture"),
+    "learned on the testbed": _of(changes_table, "learned_testbed"),
+    "learned on the walker": _of(changes_table, "learned_walker"),
+    "learned at 1.6 s": _of(changes_table, "learned_walker_1600ms"),
+    "learned on other bases": _of(changes_table, "learned_walker_bases"),
+    "ceilings of learning": _of(partial(changes_table, metrics=CEILINGS), "learned_ceilings"),
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
     "errors of the IMU": _of(walks.imu_errors, "walker_imu"),
     "gravity torques": _of(walks.gravity_torques, "gravity_torque"),
