@@ -46,7 +46,7 @@ def test_words_and_lines_of_a_chart_have_a_colour_of_the_night(tmp_path: Path, m
     page = (folder / "report.html").read_text(encoding="utf-8")
     specs = re.findall(r'<script type="application/json" id="c\d+-spec">(.*?)</script>', page, flags=re.DOTALL)
     assert len(specs) >= 3
-    seen = set(re.findall(r"#[0-9a-f]{6}", "".join(json.dumps(json.loads(spec)) for spec in specs)))
+    seen: set[str] = set(re.findall(r"#[0-9a-f]{6}", "".join(json.dumps(json.loads(spec)) for spec in specs)))
     assert {INK, GRID} <= seen
     assert {c for c in seen - SOFT if contrast(colours.get(c, c), PAPER) < 3.0} == set()
     assert all(1.05 < contrast(NIGHT[colour], PAPER) < 3.0 for colour in SOFT)
