@@ -51,19 +51,22 @@ import baselines
 class Counted:
     """A share of what `input` commands, slowly; the first step of a cell is noted in a file."""
 
-    def __init__(self, env, cell, begun):
-        self._own, self._share, self._begun, self._noted = baselines.make("input", env), cell / 20.0, begun, cell
+    def __init__(self, env, cell, folder):
+        self._own, self._share, self._folder, self._noted = baselines.make("input", env), cell / 20.0, folder, cell
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         if self._noted is not None:
-            with open(self._begun, "a") as file:
+            with open(f"{self._folder}/begun", "a") as file:
                 file.write(f"{self._noted}\\n")
             self._noted = None
         time.sleep(0.002)
         action, state = self._own.predict(observation, state, episode_start, deterministic)
         return action * self._share, state
 '''
-"""A policy whose cells can be told apart, and last about half a second."""
+"""A policy whose cells can be told apart, and last about half a second.
+
+It is given a folder. A file that options name belongs to the key of a cell, and this one changes with every cell.
+"""
 
 
 def empty(number: int, report: Callable[[int], None]) -> int:
@@ -163,9 +166,7 @@ class Comparison:
     def conditions(self) -> list[Condition]:
         """Its cells."""
         policies = [
-            PolicySpec(
-                name="counted.py:Counted", label=f"p{n}", options={"cell": n, "begun": str(self.folder / "begun")}
-            )
+            PolicySpec(name="counted.py:Counted", label=f"p{n}", options={"cell": n, "folder": str(self.folder)})
             for n in range(CELLS)
         ]
         return [Condition(policy=policy, reference=SINE, episodes=2) for policy in policies]
