@@ -155,6 +155,28 @@ def test_a_key_changes_with_the_source_of_a_users_policy(tmp_path: Path, monkeyp
     assert cell_key(condition) == keys[-1]
 
 
+def test_a_cell_whose_policy_changed_while_it_was_played_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a result of the older policy under the key of the newer one, which --resume would take."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("import baselines\n\ndef make(env):\n    return baselines.make('input', env)\n")
+    condition, store = CONDITIONS[0].replace(policy=PolicySpec(name="mine.py:make")), Store(tmp_path / "cells")
+
+    def edited(condition: Condition, **options: Any) -> Evaluation:
+        result = evaluate(condition, **options)
+        Path("mine.py").write_text("import baselines\n\ndef make(env):\n    return baselines.make('zero', env)\n")
+        return result
+
+    with monkeypatch.context() as context:
+        context.setattr("train.cells.play.evaluate", edited)
+        run_conditions([condition], Console(width=200), store=store)
+    assert "is not kept: a file that it names changed" in capsys.readouterr().out
+    assert store.get(condition) is None
+    run_conditions([condition], Console(quiet=True), store=store)
+    assert store.get(condition) is not None
+
+
 def test_other_versions_are_refused_with_both() -> None:
     with pytest.raises(VersionsDifferError, match=r"on node7 .*numpy 2\.1 there, 2\.4 here"):
         require_same({"numpy": "2.4", "pin": "4"}, {"numpy": "2.1", "pin": "4"}, "node7")

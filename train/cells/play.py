@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from elastic_env.core.errors import ElasticError
+from train.cells.key import cell_key
 from train.cells.store import Store
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import Evaluation, PolicyFailedError, evaluate, num_steps
@@ -76,6 +77,7 @@ class _Playing:
         steps = num_steps(conditions)
         self._longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
         self._steps = [steps[number] for number in self._longest_first]
+        self._keys = [] if store is None else [cell_key(conditions[number]) for number in self._longest_first]
         self._played = [0] * len(conditions)
         self._note = ""
         self._show: Show = lambda *_: None
@@ -115,8 +117,10 @@ class _Playing:
 
     def _ended(self, number: int, outcome: Outcome) -> None:
         self._played[number] = self._steps[number]
-        if outcome.error is None and self._store is not None:
-            self._store.keep(outcome.value)
+        if outcome.error is not None or self._store is None or self._store.keep(outcome.value, self._keys[number]):
+            return
+        name = _name(self._conditions[self._longest_first[number]])
+        self._console.print(f"{name} is not kept: a file that it names changed while it was played", soft_wrap=True)
 
     def _moved(self, number: int) -> None:
         name = _name(self._conditions[self._longest_first[number]])

@@ -38,14 +38,25 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
             return None
 
-    def keep(self, evaluation: Evaluation) -> None:
-        """Keep what came out of a condition.
+    def keep(self, evaluation: Evaluation, key: str | None = None) -> bool:
+        """Keep what came out of a condition, unless what it depends on has changed since it began.
+
+        Args:
+            evaluation: What came out.
+            key: Key of the condition before it was played; None where nothing can have changed.
+
+        Returns:
+            Whether it is kept.
 
         Raises:
             OSError: The disk is full, or the folder cannot be written; cells that were kept before stay.
         """
+        file = self._file(evaluation.condition)
+        if key is not None and file.stem != key:
+            return False
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(self._file(evaluation.condition), _written(evaluation))
+        write_whole(file, _written(evaluation))
+        return True
 
     def _file(self, condition: Condition) -> Path:
         return self.folder / f"{cell_key(condition)}.npz"
