@@ -37,7 +37,7 @@ from train.report.leaderboard import (
     write_leaderboard,
 )
 from train.report.pages.learned import MAPS
-from train.report.pages.write import TABLES, marks, page_with, pages
+from train.report.pages.write import TABLES, link_encoders, marks, page_with, pages
 from train.report.pages.write import Results as PageResults
 from train.report.pages.write import main as write_pages
 from train.runs.folders import run_folder
@@ -269,7 +269,10 @@ def test_one_changed_number_changes_every_page_that_shows_it() -> None:
     standings = [replace(s, base=base) if s is found[0] else s for s in results.standings]
     learned = [{**row, "base_mean": "0.0666"} for row in results.learned]
     maps = {name: [replace(m, y_is="another axis") for m in own] for name, own in results.maps.items()}
-    changed = PageResults(standings, walks, gallery, learned, maps)
+    arm = [{**row, "end_effector_error_rms_m": "0.0555"} for row in results.arm[:1]] + [*results.arm[1:]]
+    changed = PageResults(standings, walks, gallery, learned, maps, arm)
+    of_arm = link_encoders(changed)
+    assert of_arm != link_encoders(results)
     of_standings = ("README.md", "leaderboard.md", "learned.md")
     for page in pages(ROOT):
         text = page.read_text(encoding="utf-8")
@@ -278,6 +281,7 @@ def test_one_changed_number_changes_every_page_that_shows_it() -> None:
         assert ("[−99, −98]" in page_with(text, changed)) == (page.name in of_standings)
         assert ("66.6" in page_with(text, changed)) == (page.name == "learned.md")
         assert ("another axis" in page_with(text, changed)) == (page.name == "maps.md")
+        assert (of_arm in page_with(text, changed)) == (page.name == "robots.md")
 
 
 # The configuration.

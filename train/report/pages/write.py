@@ -12,7 +12,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from scipy.stats import bootstrap
+
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
@@ -32,6 +36,7 @@ TABLES = {
     "demo_episodes.csv": "copy it from runs/demo/episodes.csv after `elastic demo`",
     "gallery.csv": "python -m train.experiments.gallery writes it",
     "learned_posture.csv": "copy it from statistics.csv after `elastic compare configs/learned_posture.yaml`",
+    "link_encoder.csv": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
 }
 """Tables of the results, and where they come from."""
 
@@ -46,6 +51,7 @@ class Results:
         gallery: Robots of the gallery, a column of `gallery.csv` by its name.
         learned: Changes by the residual on `adaptive_posture`, a column of `statistics.csv` by its name.
         maps: Maps of what learning adds, by the name of their file.
+        arm: Episodes of an arm, a column of `episodes.csv` by its name.
     """
 
     standings: Sequence[Standing]
@@ -53,6 +59,7 @@ class Results:
     gallery: Sequence[Mapping[str, str]] = ()
     learned: Sequence[Mapping[str, str]] = ()
     maps: Mapping[str, Sequence[LearnedMap]] = field(default_factory=dict)
+    arm: Sequence[Mapping[str, str]] = ()
 
     @classmethod
     def read(cls, folder: Path) -> "Results":
@@ -65,8 +72,8 @@ class Results:
             if not (folder / name).is_file():
                 raise ConfigurationError(f"{folder / name} is missing; {source}")
         maps = {name: learned_maps(folder / f"{name}.csv") for name in MAPS}
-        walks, gallery, learned = (_rows(folder / name) for name in TABLES)
-        return cls(read_leaderboard(folder / "leaderboard.csv"), walks, gallery, learned, maps)
+        walks, gallery, learned, arm = (_rows(folder / name) for name in TABLES)
+        return cls(read_leaderboard(folder / "leaderboard.csv"), walks, gallery, learned, maps, arm)
 
 
 def _rows(table: Path) -> list[dict[str, str]]:
@@ -121,6 +128,46 @@ def gallery_table(results: Results) -> str:
     return markdown_table(head, ["---", "---:", "---", "---", *["---:"] * 6], rows) + "\n"
 
 
+_FIRST_ARM = "panda"
+"""Robot of the gallery that README begins with."""
+_OF_ARM, _TOOL = ("input", "link_encoder"), "end_effector_error_rms_m"
+"""Policies of an arm that are compared, and by what."""
+
+
+def one_arm(results: Results) -> str:
+    """How far one arm of the gallery sags at rest, with and without compensation."""
+    row = next(row for row in results.gallery if row["robot"] == _FIRST_ARM)
+    shown = [[f"{1e3 * float(row[f'{kind}{policy}_rms_m']):.1f}" for policy in ("uncompensated", "input")]
+             for kind in ("", "soft_")]  # fmt: skip
+    lines = [[f"{row['title']}, sag at rest [mm]", "without", "input"],
+             ["K as assumed", *shown[0]], ["K 30 % softer", *shown[1]]]  # fmt: skip
+    text = "\n".join(f"{title:32}{without:>9}{compensated:>8}" for title, without, compensated in lines)
+    return f"```text\n{text}\n```\n"
+
+
+def link_encoders(results: Results) -> str:
+    """What encoders on the links of an arm are worth: error of the end effector, episode by episode."""
+    rows = []
+    for scenario, own in grouped(results.arm, lambda row: row["scenario"]).items():
+        errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _OF_ARM}
+        base, other = (errors[policy] for policy in _OF_ARM)
+        ends = bootstrap(
+            (base, other), _change, paired=True, vectorized=True, method="BCa", rng=np.random.default_rng(0)
+        ).confidence_interval
+        change = " ".join([_percent(_change(base, other)), f"[{_percent(ends.low)}, {_percent(ends.high)}]"])
+        rows.append([f"`{scenario}`", f"{1e3 * base.mean():.2f}", f"{1e3 * other.mean():.2f}", change])
+    head = ["scenario", *(f"`{policy}` [mm]" for policy in _OF_ARM), "change"]
+    return markdown_table(head, ["---", "---:", "---:", "---:"], rows) + "\n"
+
+
+def _change(base: Array, other: Array, axis: int = -1) -> Array:
+    return np.asarray(other.mean(axis=axis) / base.mean(axis=axis) - 1.0)
+
+
+def _percent(value: float | Array) -> str:
+    return f"{100.0 * float(value):+.0f}".replace("-", "−") + " %"
+
+
 def gallery_pictures(results: Results) -> str:
     """Pictures of the robots of the gallery, each under its name."""
     return "\n".join(
@@ -138,6 +185,8 @@ PARTS: Mapping[str, Callable[[Results], str]] = {
     "what learning adds": lambda results: claims_markdown(results.standings),
     "learning in short": learning_in_short,
     "walks beside the paper": walks_beside_the_paper,
+    "one arm": one_arm,
+    "link encoders": link_encoders,
     "gallery": gallery_table,
     "gallery pictures": gallery_pictures,
     "learned posture": lambda results: changes_table(results.learned),
