@@ -267,7 +267,7 @@ def test_a_residual_is_trained_on_a_robot_of_ones_own_and_compared(
         'scenarios: [soft, spread]\npolicies: ["residual:runs/learned/seed_0/last"]\n'
     )
     main(["compare", "compare.yaml"])
-    table = (tmp_path / "runs" / "compared" / "summary.md").read_text()
+    table = (tmp_path / "runs" / "compared" / "statistics.csv").read_text()
     assert "held out" in table
     with pytest.raises(ConfigurationError, match=f"is a residual for the {name}, the environment is the testbed"):
         baselines.make("residual:runs/learned/seed_0/last", gymnasium.make("elastic_env/Testbed-v0"))

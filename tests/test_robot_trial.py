@@ -3,6 +3,7 @@
 import csv
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -15,9 +16,10 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.arm_references import Poses
-from elastic_env.robots.gallery import GALLERY, gallery_joints
+from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
 from elastic_env.runtime.joint_task import JointPlant
+from tests.gallery_files import FOLDER
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
@@ -130,6 +132,18 @@ def test_shares_are_finite_differences_of_mujoco() -> None:
     np.testing.assert_allclose([one.end_effector_rms_m for one in shares], alone, rtol=1e-6, atol=1e-9)
     explained = np.einsum("pji,pi->j", parts, errors) / np.sum(np.square(errors))
     np.testing.assert_allclose([one.share for one in shares], explained, atol=1e-7)
+    assert sum(one.share for one in shares) == pytest.approx(1.0)
+
+
+def test_the_robot_of_the_readme_is_what_its_command_plays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a name that the command does not know, and a robot that its servos or springs cannot hold."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (name,) = re.findall(r"&& elastic robot (\w+)$", readme, flags=re.MULTILINE)
+    for function in (gallery_file, gallery_robot, gallery_joints):
+        monkeypatch.setattr(f"train.experiments.robot.{function.__name__}", partial(function, folder=FOLDER))
+    config = configure_robot(**robot_arguments(RobotTrial(model=name)), reference=SEVERAL)
+    shares = joint_shares(config.robot.plant(config))
+    assert len(shares) == 7
     assert sum(one.share for one in shares) == pytest.approx(1.0)
 
 

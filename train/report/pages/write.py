@@ -18,7 +18,7 @@ from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
 from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
-from train.report.pages import joints, walks
+from train.report.pages import arms, joints, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
 from train.report.pages.learned import CEILINGS, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
@@ -43,6 +43,7 @@ TABLES = {
         ("learned_walker_bases", "learned_ceilings"),
         "copy it from statistics.csv after the comparison in docs/learned.md of policies that you have trained",
     ),
+    "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
     "drawn_robots": "copy it from robots.csv after `elastic compare configs/drawn_robots.yaml`",
     **{
         kept.table or name: f"python -m train.report.pages.keep writes it from a run of configs/{name}.yaml"
@@ -168,6 +169,8 @@ PARTS: Mapping[str, Part] = {
     "published controllers": _of_standings(walks.published_controllers),
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
+    "one arm": _of(arms.one_arm, "gallery"),
+    "link encoders": _of(arms.link_encoders, "link_encoder"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned posture": _of(changes_table, "learned_posture"),

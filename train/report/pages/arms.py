@@ -1,0 +1,53 @@
+"""Tables of arms: how far one sags, and what encoders on its links are worth."""
+
+import numpy as np
+from scipy.stats import bootstrap
+
+from elastic_env.core.signals import Array
+from train.evaluate.evaluate import grouped
+from train.report.pages.cells import Rows, minus
+from train.runs.escaping import markdown_table
+
+_FIRST = "panda"
+"""Robot of the gallery that README begins with."""
+_POLICIES, _TOOL = ("input", "link_encoder"), "end_effector_error_rms_m"
+"""Policies of an arm that are compared, and by what."""
+
+
+def one_arm(gallery: Rows) -> str:
+    """How far one arm of the gallery sags at rest, with and without compensation."""
+    row = next(row for row in gallery if row["robot"] == _FIRST)
+    shown = [
+        [f"{1e3 * float(row[f'{kind}{policy}_rms_m']):.1f}" for policy in ("uncompensated", "input")]
+        for kind in ("", "soft_")
+    ]
+    lines = [
+        [f"{row['title']}, sag at rest [mm]", "without", "input"],
+        ["K as assumed", *shown[0]],
+        ["K 30 % softer", *shown[1]],
+    ]
+    text = "\n".join(f"{title:32}{without:>9}{compensated:>8}" for title, without, compensated in lines)
+    return f"```text\n{text}\n```\n"
+
+
+def link_encoders(episodes: Rows) -> str:
+    """What encoders on the links of an arm are worth: error of the end effector, episode by episode."""
+    rows = []
+    for scenario, own in grouped(episodes, lambda row: row["scenario"]).items():
+        errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES}
+        base, other = (errors[policy] for policy in _POLICIES)
+        ends = bootstrap(
+            (base, other), _change, paired=True, vectorized=True, method="BCa", rng=np.random.default_rng(0)
+        ).confidence_interval
+        change = f"{_percent(_change(base, other))} [{_percent(ends.low)}, {_percent(ends.high)}]"
+        rows.append([f"`{scenario}`", f"{1e3 * base.mean():.2f}", f"{1e3 * other.mean():.2f}", change])
+    head = ["scenario", *(f"`{policy}` [mm]" for policy in _POLICIES), "change"]
+    return markdown_table(head, ["---", "---:", "---:", "---:"], rows) + "\n"
+
+
+def _change(base: Array, other: Array, axis: int = -1) -> Array:
+    return np.asarray(other.mean(axis=axis) / base.mean(axis=axis) - 1.0)
+
+
+def _percent(value: float | Array) -> str:
+    return minus(f"{100.0 * float(value):+.0f}") + " %"
