@@ -28,6 +28,21 @@ def test_a_spring_without_damper_has_the_limit_of_the_textbook(integrator: str, 
     assert omega * largest_stable_timestep(model) == pytest.approx(limit, rel=2e-3)
 
 
+def test_a_model_that_no_step_follows_is_refused_without_messages_of_mujoco(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a hundred warnings before the one sentence, and a file in the user's folder."""
+    monkeypatch.chdir(tmp_path)
+    model = mujoco.MjModel.from_xml_string(SPRING.format(integrator="Euler", stiffness=1e30))
+    with pytest.raises(ConfigurationError, match="no physics step from"):
+        largest_stable_timestep(model)
+    assert (capfd.readouterr(), list(tmp_path.iterdir())) == (("", ""), [])
+    data = mujoco.MjData(model)
+    data.qpos[0] = np.nan
+    mujoco.mj_checkPos(model, data)  # elsewhere warnings are said as before
+    assert (tmp_path / "MUJOCO_LOG.TXT").is_file()
+
+
 @pytest.mark.parametrize(("stiffness", "is_refused"), [(4e4, False), (6e4, True), (1e5, True)])
 def test_a_walker_that_would_explode_is_refused_with_the_largest_step(stiffness: float, is_refused: bool) -> None:
     """Catches a stiffness that ends as "fell" with joints at a million rad/s."""

@@ -8,6 +8,8 @@ a joint back.
 """
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import mujoco
 import numpy as np
@@ -40,7 +42,8 @@ def spectral_radius(model: mujoco.MjModel, timestep_s: float | None = None) -> f
     linear = _without_constraints(model)
     if timestep_s is not None:
         linear.opt.timestep = timestep_s
-    A = _transition(linear)
+    with _without_messages():
+        A = _transition(linear)
     return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0)) if np.isfinite(A).all() else float("inf")
 
 
@@ -105,6 +108,18 @@ def stable_timestep(model: mujoco.MjModel, control_period_s: float) -> float:
     if is_stable(model):
         return float(model.opt.timestep)
     return control_period_s / int(np.ceil(control_period_s * _ROOM / largest_stable_timestep(model) - 1e-9))
+
+
+@contextmanager
+def _without_messages() -> Iterator[None]:
+    """No warnings of MuJoCo on the terminal or in MUJOCO_LOG.TXT: here a step that explodes is an answer."""
+    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_console = silent.logto_file = False
+    silent.set()
+    try:
+        yield
+    finally:
+        before.set()
 
 
 def _without_constraints(model: mujoco.MjModel) -> mujoco.MjModel:
