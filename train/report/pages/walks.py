@@ -131,10 +131,10 @@ def drawn_robots(rows: Rows) -> str:
     for row in rows:
         found.setdefault((row["scenario"], row["policy"]), {})[row["metric"]] = row
     lines = [
-        [f"`{scenario}`", "residual trained at 3 s" if policy == "residual" else f"`{policy}`",
+        [f"`{scenario}`", policy if " " in policy else f"`{policy}`",
          *(" / ".join(f"{1e3 * float(own[metric][name]):.1f}" for name in ("mean", "interquartile_mean", "worst_tenth"))
            for metric in (PELVIS, ZMP)), own[PELVIS]["failed"], own[PELVIS]["episodes"]]
-        for (scenario, policy), own in found.items()
+        for (scenario, policy), own in sorted(found.items(), key=lambda item: item[0][0])
     ]  # fmt: skip
     head = ["scenario", "policy", "pelvis error", "ZMP deviation", "falls", "robots"]
     return markdown_table(head, ["---"] * 2 + _figures(4), lines) + "\n"
