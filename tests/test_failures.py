@@ -1,5 +1,6 @@
 """What goes wrong with the system or with a user's policy is one sentence, and an exit code that says which."""
 
+import ctypes
 import errno
 import io
 import json
@@ -20,7 +21,7 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import PolicyFailedError, blamed
-from train.runs.failures import explained
+from train.runs.failures import EndedError, explained
 from train.runs.progress import duration, plain_progress
 from train.workers.calls import WorkerKilledError
 
@@ -232,6 +233,23 @@ def test_an_interrupt_while_modules_load_is_one_word() -> None:
     assert said.splitlines()[-1].endswith("interrupted")
     assert program.returncode == 130
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("asked", [KeyboardInterrupt, EndedError])
+def test_an_interrupt_that_c_code_quotes_is_an_interrupt(asked: type[KeyboardInterrupt]) -> None:
+    """Catches "a defect" where Ctrl-C comes while `ctypes` converts an argument, as while Numba compiles."""
+
+    class Interrupted:
+        @classmethod
+        def from_param(cls, _: object) -> object:
+            raise asked(signal.SIGINT)
+
+    function = ctypes.CDLL(None).abs
+    function.argtypes = [Interrupted]
+    with pytest.raises(ctypes.ArgumentError) as caught:
+        function(1)
+    assert explained(caught.value) == ("interrupted", 130)
+    assert explained(ctypes.ArgumentError("argument 1: TypeError: wrong type")) is None
 
 
 def limited(size: int) -> Callable[[], None]:

@@ -21,7 +21,7 @@ from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
 from train.commands.options import CONSOLE
 from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, Robot, View
-from train.runs.failures import DEFECT, explained
+from train.runs.failures import DEFECT, EndedError, explained
 from train.runs.progress import say_what_is_compiled
 
 Command = (
@@ -57,10 +57,6 @@ def _told(error: Exception) -> int:
     return code
 
 
-class _EndedError(KeyboardInterrupt):
-    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
-
-
 _SAME_WISH_S = 2.0
 """How long a further signal does not interrupt what the first one asked for."""
 
@@ -75,7 +71,7 @@ def _ended_by(*numbers: int) -> Iterator[None]:
         now = time.monotonic()
         if now - asked_s > _SAME_WISH_S:
             asked_s = now
-            raise _EndedError(number)
+            raise EndedError(number)
 
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in numbers if is_main}
@@ -111,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
         except Exception as error:
             sys.exit(_told(error))
         except KeyboardInterrupt as error:
-            number = error.args[0] if isinstance(error, _EndedError) else signal.SIGINT
+            number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
             Console(stderr=True, emoji=False).print(
                 _with_notes(error, said), highlight=False, markup=False, soft_wrap=True

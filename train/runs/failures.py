@@ -10,6 +10,7 @@
 | 128 + n | ended by signal n |
 """
 
+import ctypes
 import errno
 from collections.abc import Iterator
 
@@ -30,6 +31,10 @@ _CURES = {
 }
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class EndedError(KeyboardInterrupt):
+    """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
 
 
 def explained(error: BaseException) -> tuple[str, int] | None:
@@ -53,8 +58,14 @@ def explained(error: BaseException) -> tuple[str, int] | None:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Whether it is Ctrl-C, which a module that is being loaded may turn into an error of its own."""
-    return any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error))
+    """Whether it is Ctrl-C, which a module that is being loaded or a call of C may turn into an error of its own."""
+    return any(isinstance(cause, KeyboardInterrupt) or _quotes_interrupt(cause) for cause in _causes(error))
+
+
+def _quotes_interrupt(error: BaseException) -> bool:
+    """Whether `ctypes` met Ctrl-C while it converted an argument: its error only quotes the exception."""
+    names = (KeyboardInterrupt.__name__, EndedError.__name__)
+    return isinstance(error, ctypes.ArgumentError) and any(name in str(error) for name in names)
 
 
 def is_full(error: BaseException) -> bool:
