@@ -217,7 +217,9 @@ def _ended(process: int) -> int:
 
 def _kill_worker(nanny: subprocess.Popen[bytes]) -> bool:
     """Kill what a program of dask keeps going; it starts another one. Whether there was one."""
-    for child in Path(f"/proc/{nanny.pid}/task/{nanny.pid}/children").read_text().split():
+    # whichever thread of the program started it
+    children = [path.read_text() for path in Path(f"/proc/{nanny.pid}/task").glob("*/children")]
+    for child in " ".join(children).split():
         if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
             os.kill(int(child), signal.SIGKILL)
             return True
