@@ -380,6 +380,23 @@ def test_a_model_of_sb3_is_exported_only_where_it_is_trusted(
     assert "no.zip is no model" in capsys.readouterr().err
 
 
+def test_the_error_of_links_with_encoders_is_that_of_the_simulation() -> None:
+    """Catches a sign, and an encoder of the motor in the place of the link's."""
+    env: Any = gymnasium.make("elastic_env/Robot-v0", scenario="ideal+soft", sensors=["link_encoder"])
+    corrected = around(env, "input", observe=("link_error",), decision_period=1)
+    features, none = Features(corrected), np.zeros(env.action_space.shape, dtype=np.float32)
+    observation, info = env.reset(seed=0)
+    for _ in range(100):
+        observation, _, _, _, info = env.step(none)
+    errors, _ = features.at(observation[None], None, np.ones(1, dtype=np.bool_), None, None)
+    truth = [info[f"link_error_{which}"] for which in ("lowest", "highest")]
+    assert max(np.abs(truth)) > 5e-3
+    np.testing.assert_allclose([errors.min(), errors.max()], truth, rtol=0.0, atol=1e-3)
+    env = gymnasium.make("elastic_env/Robot-v0")
+    with pytest.raises(ConfigurationError, match=r"link_error.*encoder_error"):
+        Features(around(env, "input", observe=("link_error",)))
+
+
 def test_errors_of_the_contact_are_those_of_the_simulation() -> None:
     """Catches a sign, a frame, the weight of the feet left out, and the wrong foot: held against the true ZMP."""
     env: Any = vector("walker", 2, scenario="ideal")

@@ -5,6 +5,7 @@
 | a group or a signal of the observation, such as `clock` or `clock.swing` | as it is in the observation |
 | `observation` | all of them |
 | `encoder_error` | encoder angles less reference angles, which are small beside both [rad] |
+| `link_error` | with encoders on the links: reference angles less the links' angles, small too [rad] |
 | `contact_error` | walker: measured ZMP [m] and load share [1] as on level ground, less the planned ones |
 | `level` | walker: attitude and foot wrenches as on level ground (`baselines.estimation.ground_level`) |
 | `bending` | walker: how much more the joints bend than the model says, and the load (`baselines.estimation.bending`) |
@@ -137,15 +138,16 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
     if name in _groups(model) or name in model.observation_table.names:
         group = model.observation_table.group(name)
         return _Instant(model.observation_table.signals[group], lambda rows: rows[:, group])
-    if name == "encoder_error":
-        return _encoder_error(model)
+    if name in _ERRORS and set(_ERRORS[name]) <= set(_groups(model)):
+        return _error(name, model)
     if isinstance(model, WalkerModel) and name == "contact_error":
         return _ContactError(model, period_s)
     if isinstance(model, WalkerModel) and name == "level":
         return GroundLevel(model, period_s)
     if isinstance(model, WalkerModel) and name == "bending":
         return BendingObserver(model)
-    further = ["encoder_error", *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
+    errors = [error for error, groups in _ERRORS.items() if set(groups) <= set(_groups(model))]
+    further = [*errors, *(["contact_error", "level", "bending"] if isinstance(model, WalkerModel) else [])]
     raise unknown_name("feature of a residual", name, [OBSERVATION, BASE_ACTION, *further, *_groups(model)])
 
 
@@ -164,11 +166,15 @@ class _Instant:
         return self._function(rows), memory
 
 
-def _encoder_error(model: RobotModel) -> _Instant:
+_ERRORS = {"encoder_error": ("encoder_angle", "reference_angle"), "link_error": ("reference_angle", "link_encoder")}
+"""Differences of two groups of the observation with a column per joint."""
+
+
+def _error(name: str, model: RobotModel) -> _Instant:
     table = model.observation_table
-    encoder, reference = (table.group(name) for name in ("encoder_angle", "reference_angle"))
-    errors = renamed(table.signals_of("encoder_angle"), "encoder_error")
-    return _Instant(errors, lambda rows: rows[:, encoder] - rows[:, reference])
+    whole, less = (table.group(group) for group in _ERRORS[name])
+    signals = renamed(table.signals_of("encoder_angle"), name)
+    return _Instant(signals, lambda rows: rows[:, whole] - rows[:, less])
 
 
 class _ContactError:
