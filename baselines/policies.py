@@ -130,6 +130,12 @@ def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     task = env.unwrapped.task.name
     if description.robot != task:
         raise ConfigurationError(f"{folder} is a residual for the {description.robot}, the environment is the {task}")
+    joints = env.unwrapped.assumed_model.joint_names
+    if description.joints not in ([], joints):
+        raise ConfigurationError(
+            f"{folder} was trained on a robot with the joints {', '.join(description.joints)}; "
+            f"the environment's has {', '.join(joints)}"
+        )
     base = make(description.base, env, **{**description.base_options, **options})
     return residual_policy(folder, base, env.unwrapped.assumed_model)
 

@@ -521,6 +521,10 @@ def test_make_reads_a_residual_and_runs_it_on_many_worlds(tmp_path: Path) -> Non
     np.testing.assert_array_equal(policy.predict(observation)[0], base.predict(observation)[0])
     with pytest.raises(ConfigurationError, match="for the testbed, the environment is the walker"):
         baselines.make(f"residual:{path}", scalar("walker"))
+    description, _ = load_residual(path)
+    (path / "residual.json").write_text(description.replace(joints=["elbow"]).model_dump_json())
+    with pytest.raises(ConfigurationError, match=r"joints elbow; the environment's has [a-z]+$"):
+        baselines.make(f"residual:{path}", envs)
 
 
 def damaged(path: Path, **changes: Any) -> None:

@@ -54,6 +54,8 @@ class ResidualDescription(Model):
 
     robot: Title
     """Task of the environment, walker or testbed."""
+    joints: list[Title] = Field(default=[], max_length=MOST_ENTRIES)
+    """Joints of the robot that it was trained on; none in folders from before they were written."""
     base: Title
     """Name of the base policy."""
     base_options: dict[str, Any] = {}

@@ -15,7 +15,7 @@ from baselines.residual.residual import ResidualDescription
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
 from train.learn.algorithms import options_named
-from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
 from train.learn.trainer import Trainer
 
 _DEFAULTS: dict[str, Any] = {"population_size": 16, "sigma": 0.3}
@@ -128,4 +128,4 @@ class ConstantSearch(Trainer):
             "weight0": np.zeros((len(constants), features), dtype=np.float32),
             "bias0": constants.astype(np.float32),
         }
-        return tensors, self.config.description()
+        return tensors, self.config.description(joints_of(self._worlds))

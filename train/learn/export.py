@@ -13,7 +13,7 @@ from torch import nn
 from baselines.residual.residual import save_residual
 from elastic_env.core.errors import ConfigurationError
 from train.learn.algorithms import algorithm_class
-from train.learn.train_config import TrainConfig, training_worlds
+from train.learn.train_config import TrainConfig, joints_of, training_worlds
 from train.runs.folders import provenance
 
 Tensors = dict[str, npt.NDArray[Any]]
@@ -53,10 +53,11 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
     return tensors, names[activations.pop()], output  # type: ignore[return-value]
 
 
-def _require_fit(tensors: Tensors, config: TrainConfig) -> None:
-    """Compare the widths of a network with what the configuration's residual sees and does."""
+def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
+    """The joints of the configuration's robot, once the widths of a network are what its residual sees and does."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
     sees, does = flatdim(worlds.single_observation_space), flatdim(worlds.single_action_space)
+    joints = joints_of(worlds)
     worlds.close()
     last = max(int(name.removeprefix("bias")) for name in tensors if name.startswith("bias"))
     given = tensors["weight0"].shape[1], len(tensors[f"bias{last}"])
@@ -65,6 +66,7 @@ def _require_fit(tensors: Tensors, config: TrainConfig) -> None:
             f"the model takes {given[0]} features and gives {given[1]} residuals, a residual on {config.base} of the "
             f"{config.env} with these settings sees {sees} and gives {does}"
         )
+    return joints
 
 
 def export_zip(
@@ -98,8 +100,8 @@ def export_zip(
     except Exception as error:  # whatever a pickle of something else leads to
         files = " with ".join(str(file) for file in (path, normaliser) if file is not None)
         raise ConfigurationError(f"{files} is no model that SB3's {config.algorithm} saved: {error}") from error
-    _require_fit(tensors, config)
+    joints = _joints_that_fit(tensors, config)
     training = {"config": config.model_dump(mode="json"), **provenance(None), "exported_from": path.name}
-    description = config.description(activation=activation, output=kind, training=training)
+    description = config.description(joints, activation=activation, output=kind, training=training)
     save_residual(output, description, tensors)
     return output

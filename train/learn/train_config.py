@@ -116,11 +116,11 @@ class TrainConfig(Model):
             seed=EVALUATION_SEED,
         )
 
-    def description(self, **network: Any) -> ResidualDescription:
+    def description(self, joints: list[str], **network: Any) -> ResidualDescription:
         """What an exported policy says of itself; `network` names its activation and output."""
         return ResidualDescription(
-            robot=environment(self.env).robot, base=self.base, base_options=self.base_options, settings=self.settings,
-            clip=self.clip, **network,
+            robot=environment(self.env).robot, joints=joints, base=self.base, base_options=self.base_options,
+            settings=self.settings, clip=self.clip, **network,
         )  # fmt: skip
 
     def is_due(self, every: int, before: int, now: int) -> bool:
@@ -143,6 +143,12 @@ class TrainConfig(Model):
 
 _WORLD_BYTES = 100_000
 """Memory of a world: measured on the walker with its policy, and on the testbed with a motion of its own."""
+
+
+def joints_of(worlds: Any) -> list[str]:
+    """Names of the joints of the robot that is trained on."""
+    names: list[str] = worlds.unwrapped.assumed_model.joint_names
+    return names
 
 
 def training_worlds(config: TrainConfig, shares: list[tuple[str, int]], threads: int) -> ResidualVectorWrapper:

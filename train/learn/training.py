@@ -27,7 +27,7 @@ from train.learn.algorithms import algorithm_class, options_named
 from train.learn.export import network_of
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.state import read_state, write_state
-from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, training_worlds
+from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
 from train.learn.trainer import Trainer
 
 _DEFAULTS: dict[str, dict[str, Any]] = {
@@ -60,7 +60,9 @@ class Training(Trainer):
         torch.set_num_threads(1)  # more would fight the threads of the physics
         torch.use_deterministic_algorithms(True)
         super().__init__(config, seed, folder, threads)
-        self._worlds = SB3VecEnv(training_worlds(config, config.shares, threads), np.random.default_rng(seed))
+        worlds = training_worlds(config, config.shares, threads)
+        self._joints = joints_of(worlds)
+        self._worlds = SB3VecEnv(worlds, np.random.default_rng(seed))
         options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
         gamma = options.get("gamma", 0.99)
         self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
@@ -210,7 +212,7 @@ class Training(Trainer):
     def _policy(self) -> tuple[dict[str, Any], ResidualDescription]:
         """The present policy, as it is exported."""
         tensors, activation, output = network_of(self.model, self._normaliser)
-        return tensors, self.config.description(activation=activation, output=output)
+        return tensors, self.config.description(self._joints, activation=activation, output=output)
 
     def _evaluate(self) -> None:
         """Score the present policy, without a trace in the random states of the training."""
