@@ -21,7 +21,7 @@ _METRICS = {
 _JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
 CEILINGS = ("pelvis_roll_rms_rad", "pelvis_pitch_rms_rad", "zmp_deviation_rms_m")
 """Metrics of the residuals that are trained and scored on one walk."""
-MAPS = ("map_stiffness_imu", "map_payload_slope")
+MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
