@@ -20,7 +20,7 @@ from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
 from train.report.pages import arms, joints, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
-from train.report.pages.learned import CEILINGS, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
+from train.report.pages.learned import ARM, CEILINGS, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -37,7 +37,7 @@ TABLES = {
     "gallery": "python -m train.experiments.gallery writes it",
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
-        for name in ("learned_posture", "learned_testbed", "learned_walker", "learned_walker_1600ms")
+        for name in ("learned_posture", "learned_robot", "learned_testbed", "learned_walker", "learned_walker_1600ms")
     },
     **dict.fromkeys(
         ("learned_walker_bases", "learned_ceilings"),
@@ -175,6 +175,7 @@ PARTS: Mapping[str, Part] = {
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned posture": _of(changes_table, "learned_posture"),
     "learned on the testbed": _of(changes_table, "learned_testbed"),
+    "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
     "learned on the walker": _of(changes_table, "learned_walker"),
     "learned at 1.6 s": _of(changes_table, "learned_walker_1600ms"),
     "learned on other bases": _of(changes_table, "learned_walker_bases"),
