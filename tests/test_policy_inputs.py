@@ -20,9 +20,11 @@ from baselines.residual.mirror import Mirror
 from baselines.residual.residual import ResidualPolicy, read_description, shipped
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper
-from baselines.walking.zmp_shift import center_of_mass_following
+from baselines.walking.walking_kernels import followed, move_pelvis_in_rows
+from baselines.walking.zmp_shift import Stances, following_share
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_kinematics import foot_pose
 from elastic_env.runtime.robot_model import WalkerModel
 from tests.test_residual import QUICK, SINE, TESTBED, WALKER, random_network, vector
 
@@ -106,6 +108,23 @@ def test_zmp_and_center_of_mass_go_where_they_are_told(name: str) -> None:
         np.testing.assert_allclose(found[[1 - axis, 3 - axis]], 0.0, atol=0.6e-3)
 
 
+def test_a_pelvis_that_moves_leaves_the_feet_where_they_were() -> None:
+    """By forward kinematics, over the whole plan. Catches a leg that is not level, and a shift beyond the reach."""
+    model = model_of(walker())
+    stances, shift = Stances.of(model), np.array([0.012, -0.02])
+    offset = np.zeros(model.plan.q.shape)
+    move_pelvis_in_rows(stances.legs, stances.rows, np.broadcast_to(shift, (len(offset), 2)), offset)
+    legs = (model.plan.q + offset).reshape(-1, 2, 6)
+    ankle, R = foot_pose(model.biped.leg, legs)
+    pelvis = model.plan.pelvis + np.append(shift, 0.0)
+    np.testing.assert_allclose(pelvis[:, None] + model.biped.hips + ankle, model.plan.ankles, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(R, np.broadcast_to(np.eye(3), R.shape), rtol=0.0, atol=1e-9)
+    far = np.zeros((1, 12))
+    move_pelvis_in_rows(stances.legs, stances.rows[:1], np.array([[0.5, 0.0]]), far)
+    ankle, _ = foot_pose(model.biped.leg, (model.plan.q[:1] + far).reshape(-1, 2, 6))
+    np.testing.assert_allclose(np.linalg.norm(ankle, axis=-1), stances.legs[0].reach, rtol=1e-9)
+
+
 def test_a_longer_left_leg_lifts_the_left_side() -> None:
     """Roll is positive to the right: the left hip rises. It cannot tilt further than both feet on the ground do."""
     roll, pitch = walked("input_output", 1.6, 2)["leg_length.difference"][4:]
@@ -157,7 +176,7 @@ def test_a_shift_of_the_center_of_mass_is_the_bounded_one() -> None:
     omega, period, p = 3.7, 0.004, np.array([0.01, -0.02])
     c, path = np.zeros(2), [np.zeros(2)]
     for _ in range(200):
-        c = center_of_mass_following(c, p, omega, period)
+        c = followed.py_func(c, p, following_share(omega, period))
         path.append(c)
     time = period * np.arange(201)[:, None]
     np.testing.assert_allclose(path, p * (1.0 - np.exp(-omega * time)), atol=1e-15)

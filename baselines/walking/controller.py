@@ -30,7 +30,7 @@ from baselines.compensation.observed import ObservedWalk, Records
 from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
 from baselines.walking import walking_kernels as kernels
 from baselines.walking.posture import hip_offsets
-from baselines.walking.zmp_shift import center_of_mass_following, center_of_mass_per_pelvis, pelvis_shift_offsets
+from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.biped import Biped
@@ -105,7 +105,7 @@ class WalkingController(PolicyWithInputs):
         gains: WalkingGains | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
-        self._model, self._biped, self._plan = model, model.biped, model.plan
+        self._biped, self._plan = model.biped, model.plan
         table = model.observation_table
         self._view, self._observed = ObservationView(table, model.control_period_s), ObservedWalk(table)
         self._attitude, self._clock = table.group("imu_attitude"), table.group("clock")
@@ -115,7 +115,7 @@ class WalkingController(PolicyWithInputs):
         self._plan_rows: Any = np.zeros(self._plan.num_steps + 1, kernels.PLAN)
         for name in kernels.PLAN.names or ():
             self._plan_rows[name] = getattr(self._plan, name)
-        self._sole, self._per_pelvis = _sole(self._biped), center_of_mass_per_pelvis(model)
+        self._stances, self._sole = Stances.of(model), _sole(self._biped)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -140,15 +140,10 @@ class WalkingController(PolicyWithInputs):
         memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(LocalFrame(com, soles)))
         kept, action = np.empty(memory.shape), np.empty((n, 12))
         before, now = self._fields(memory), self._fields(kept)
-        is_shifted = inputs.zmp is not None or inputs.com is not None or np.count_nonzero(memory[:, _PLANNED]) > 0
-        kept[:, _PLANNED] = self._planned_shift(inputs, memory) if is_shifted else 0.0
         shares = _NO_SHARES if inputs.zmp_shift is None else self._shifted_shares(rows, inputs.zmp_shift)
         seen = self._observed.fields(rows), com, soles, shares
-        walk = self._constants, self._plan_rows, self._ramp
+        walk = self._constants, self._plan_rows, *self._stances, self._ramp
         kernels.control(walk, seen, _dense(inputs, n), before, now, action)
-        if is_shifted:
-            coming = np.minimum(self._row(rows) + 1, self._plan.num_steps)
-            action += pelvis_shift_offsets(self._model, coming, now["planned"] / self._per_pelvis)
         return action.astype(np.float32).reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
@@ -168,16 +163,8 @@ class WalkingController(PolicyWithInputs):
 
     def _row(self, rows: Array) -> IntArray:
         """Rows of the plan at the ends of the last control periods, (num_worlds,)."""
-        return np.clip(np.round(rows[:, self._clock][:, 0] / self._dt).astype(np.int64) - 1, 0, self._plan.num_steps)
-
-    def _planned_shift(self, inputs: PolicyInputs, memory: Array) -> Array:
-        """Shift of the planned center of mass for the input `zmp`, and in all on the ramp, (num_worlds, 4) [m]."""
-        before = self._fields(memory)
-        following, steps = before["following"], before["steps"].astype(np.int64) + 1
-        if inputs.zmp is not None:
-            following = center_of_mass_following(following, inputs.zmp, self._plan.omega, self._dt)
-        share = self._ramp[np.minimum(steps, len(self._ramp) - 1)][:, None]
-        return np.hstack([following, share * (following if inputs.com is None else following + inputs.com)])
+        row = np.rint(rows[:, self._clock.start] / self._dt).astype(np.int64) - 1
+        return np.minimum(np.maximum(row, 0), self._plan.num_steps)
 
     def _shifted_shares(self, rows: Array, shift: Array) -> Array:
         """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]."""
@@ -185,8 +172,6 @@ class WalkingController(PolicyWithInputs):
 
 
 _NO_SHARES: Array = np.empty(0)
-_PLANNED = slice(10, 14)
-"""Columns of the memory that hold the shift of the planned center of mass."""
 
 
 def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> tuple[Any, ...]:
@@ -201,6 +186,8 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> t
         "friction_deflection": model.coulomb_friction.reshape(2, 6) / stiffness,
         "velocity_share": _share(period_s, gains.velocity_filter_s),
         "zmp_share": _share(period_s, gains.zmp_filter_s),
+        "following_share": following_share(model.plan.omega, period_s),
+        "per_pelvis": center_of_mass_per_pelvis(model),
         "weight_share": 0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s),
     }  # fmt: skip
     return tuple(values[name] for name in kernels.CONTROLLER.names or ())
@@ -211,6 +198,10 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     if inputs.is_empty:
         return _none(num_worlds)
     dense = np.zeros(num_worlds, kernels.INPUTS)
+    if inputs.zmp is not None:
+        dense["zmp"] = inputs.zmp
+    if inputs.com is not None:
+        dense["com"] = inputs.com
     if inputs.leg_length is not None:
         dense["leg_length"] = inputs.leg_length[:, 0]
     if inputs.balance_gain is not None:

@@ -23,7 +23,8 @@ CONTROLLER = _row_type(
     ("period_s", np.float64), ("is_com_fed_back", np.bool_),
     ("thigh", np.float64), ("shank", np.float64), ("footholds", np.float64, (2, 2)),  # [m]
     ("weight", np.float64), ("weight_of_feet", np.float64),  # of the robot, below the sensors [N]
-    ("omega", np.float64),  # of the pendulum [rad/s]
+    ("omega", np.float64), ("following_share", np.float64),  # of the pendulum [rad/s], of its way in a period
+    ("per_pelvis", np.float64, (2,)),  # motion of the center of mass per motion of the pelvis
     ("ankle_stiffness", np.float64, (2, 2)),  # pitch and roll of the legs [N·m/rad]
     ("friction_deflection", np.float64, (2, 6)), ("friction_rate_rad_s", np.float64),  # [rad], [rad/s]
     ("force_difference", np.float64), ("force_difference_decay_s", np.float64),
@@ -32,6 +33,16 @@ CONTROLLER = _row_type(
     ("velocity_share", np.float64), ("zmp_share", np.float64), ("weight_share", np.float64),  # of a step in a period
 )  # fmt: skip
 """What the controller assumes and its gains; shares are those that first-order filters make in one period."""
+
+LEGS = _row_type(
+    ("thigh", np.float64), ("shank", np.float64), ("reach", np.float64), ("hips", np.float64, (2, 3)),  # [m]
+)  # fmt: skip
+"""The legs, to move the pelvis over feet that stay; the ankles come no further from the hips than the reach."""
+
+STANCE = _row_type(
+    ("pelvis", np.float64, (3,)), ("ankles", np.float64, (2, 3)), ("q", np.float64, (2, 6)),  # [m], [rad]
+)  # fmt: skip
+"""Where the plan has pelvis and ankles, and its joint angles, one row per control step."""
 
 PLAN = _row_type(("share", np.float64), ("com", np.float64, (2,)), ("com_dot", np.float64, (2,)))
 """What it needs of the plan, one row per control step."""
@@ -46,6 +57,7 @@ MEMORY = _row_type(
 """What the controller keeps of a world."""
 
 INPUTS = _row_type(
+    ("zmp", np.float64, (2,)), ("com", np.float64, (2,)),  # [m]
     ("leg_length", np.float64), ("offset", np.float64, (2, 6)),  # [m], [rad]
     ("balance_gain", np.float64), ("deflection", np.float64, (2, 6)),  # relative changes [1]
 )  # fmt: skip
@@ -67,10 +79,12 @@ POSTURE_MEMORY = _row_type(
 
 
 class Walk(NamedTuple):
-    """What does not change: row of `CONTROLLER`, rows of `PLAN`, share of the feedback in the first steps."""
+    """What does not change: rows of `CONTROLLER`, `PLAN`, `LEGS`, `STANCE`, and the share of the feedback at first."""
 
     controller: Any
     plan: Any
+    legs: Any
+    stances: Any
     ramp: Array
 
 
@@ -95,7 +109,7 @@ def control(walk: Any, seen: Any, inputs: Any, before: Any, now: Any, action: Ar
         seen: `Seen`.
         inputs: Rows of `INPUTS`, (n,).
         before: Rows of `MEMORY`, (n,).
-        now: To be filled, but for `following` and `planned`, (n,).
+        now: To be filled, (n,).
         action: To be filled, (n, 12) [rad].
     """
     walk, seen = Walk(*walk), Seen(*seen)
@@ -106,6 +120,7 @@ def control(walk: Any, seen: Any, inputs: Any, before: Any, now: Any, action: Ar
         planned = walk.plan[row]
         own.steps = last.steps + 1.0
         ramp = walk.ramp[int(min(own.steps, len(walk.ramp) - 1.0))]
+        shift_plan(controller, given, ramp, last, own)
         weigh(controller, shown, last, own)
         share = planned.share if len(seen.shares) == 0 else seen.shares[world]
         balance_feet(controller, shown, share, given.balance_gain, last, own)
@@ -115,6 +130,75 @@ def control(walk: Any, seen: Any, inputs: Any, before: Any, now: Any, action: Ar
         follow_com(controller, shown, planned, given.balance_gain, last, own)
         for leg in range(2):
             offset_leg(controller, shown, given, own, leg, ramp, action[world])
+        coming = walk.stances[min(row + 1, len(walk.stances) - 1)]
+        x, y = own.planned[0] / controller.per_pelvis[0], own.planned[1] / controller.per_pelvis[1]
+        move_pelvis(walk.legs[0], coming, x, y, action[world])
+
+
+@compiled
+def shift_plan(controller: Any, given: Any, ramp: float, last: Any, own: Any) -> None:
+    """Shift of the planned center of mass for the input `zmp`, and in all on the ramp [m]."""
+    for i in range(2):
+        own.following[i] = followed(last.following[i], given.zmp[i], controller.following_share)
+        own.planned[i] = ramp * (own.following[i] + given.com[i])
+
+
+@compiled
+def followed(center: float, zmp: float, share: float) -> float:
+    """The center of mass a period later, under a ZMP shift that stays as it is; see `baselines.walking.zmp_shift`."""
+    return center + share * (zmp - center)
+
+
+@compiled
+def move_pelvis_in_rows(legs: Any, stances: Any, shift: Array, offset: Array) -> None:
+    """`move_pelvis` in every row of a plan: `LEGS`, (1,), rows of `STANCE`, (n,), shift, (n, 2), offset, (n, 12)."""
+    for row in range(len(shift)):
+        move_pelvis(legs[0], stances[row], shift[row, 0], shift[row, 1], offset[row])
+
+
+@compiled
+def move_pelvis(legs: Any, stance: Any, x: float, y: float, offset: Array) -> None:
+    """Add the offsets that move the planned pelvis over feet that stay, (12,) [rad]; no shift changes no bit.
+
+    Where a foot would be out of reach, the leg is as long as it can be.
+
+    Args:
+        legs: Row of `LEGS`.
+        stance: Row of `STANCE`.
+        x: Shift forward [m].
+        y: Shift to the left [m].
+        offset: To be added to.
+    """
+    if x == 0.0 and y == 0.0:
+        return
+    for leg in range(2):
+        ankle_x = stance.ankles[leg, 0] - (stance.pelvis[0] + x) - legs.hips[leg, 0]
+        ankle_y = stance.ankles[leg, 1] - (stance.pelvis[1] + y) - legs.hips[leg, 1]
+        ankle_z = stance.ankles[leg, 2] - stance.pelvis[2] - legs.hips[leg, 2]
+        distance = math.sqrt(ankle_x**2 + ankle_y**2 + ankle_z**2)
+        drawn_in = min(1.0, legs.reach / distance)
+        roll, pitch, knee = level_leg(legs, drawn_in * ankle_x, drawn_in * ankle_y, drawn_in * ankle_z)
+        first, q = 6 * leg, stance.q[leg]
+        offset[first] -= q[0]
+        offset[first + 1] += roll - q[1]
+        offset[first + 2] += pitch - q[2]
+        offset[first + 3] += knee - q[3]
+        offset[first + 4] += -(pitch + knee) - q[4]
+        offset[first + 5] += -roll - q[5]
+
+
+@compiled
+def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle less hip [m].
+
+    `elastic_env.dynamics.leg_kinematics.leg_angles` has soles of every attitude.
+    """
+    distance = math.sqrt(x**2 + y**2 + z**2)
+    thigh, shank = legs.thigh, legs.shank
+    cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
+    knee = math.acos(min(max(cosine, -1.0), 1.0))
+    of_shank = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))  # from the line of hip and ankle
+    return math.atan2(y, -z), of_shank + math.atan2(-x, math.hypot(y, z)) - knee, knee
 
 
 @compiled

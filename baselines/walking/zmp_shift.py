@@ -19,11 +19,14 @@ and while p changes, the ZMP is shifted by p − ṗ/ω: it comes late by 1/ω, 
 Stabilization", ICRA.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from scipy import linalg
 
-from elastic_env.core.signals import Array, IntArray
-from elastic_env.dynamics.leg_kinematics import LegGeometry, leg_angles
+from baselines.walking import walking_kernels as kernels
+from elastic_env.core.signals import Array
+from elastic_env.dynamics.leg_kinematics import LegGeometry
 from elastic_env.runtime.robot_model import WalkerModel
 
 _PROBE_M = 0.005
@@ -48,16 +51,14 @@ def center_of_mass_shift(zmp: Array, omega: float, period_s: float) -> Array:
     return linalg.solve_banded((1, 1), bands, zmp)
 
 
-def center_of_mass_following(center: Array, zmp: Array, omega: float, period_s: float) -> Array:
-    """The c of a ZMP shift that stays as it is, a period later.
+def following_share(omega: float, period_s: float) -> float:
+    """Share of its way that the c of a ZMP shift goes in a period, where the shift stays as it is [1].
 
     Args:
-        center: Present c, (..., k) [m].
-        zmp: Shift p from now on, (..., k) [m].
         omega: Natural frequency of the pendulum [rad/s].
         period_s: The period [s].
     """
-    return center + (1.0 - float(np.exp(-omega * period_s))) * (zmp - center)
+    return 1.0 - float(np.exp(-omega * period_s))
 
 
 def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
@@ -72,26 +73,20 @@ def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
     return np.diagonal((com[:2] - com[2:])[:, :2] / (2.0 * _PROBE_M)).copy()
 
 
-def pelvis_shift_offsets(model: WalkerModel, row: IntArray | slice, shift: Array) -> Array:
-    """Offsets of the joints that move the planned pelvis over feet that stay; zero for no shift, to the last bit.
+class Stances(NamedTuple):
+    """What moves the planned pelvis over feet that stay: a row of `LEGS` and rows of `STANCE` of the kernels."""
 
-    Where a foot would be out of reach, the leg is as long as it can be.
+    legs: Any
+    rows: Any
 
-    Args:
-        model: Assumed walker.
-        row: Rows of the plan.
-        shift: Of the pelvis at each of them, x forward and y left, (rows, 2) [m].
-
-    Returns:
-        (rows, 12) [rad].
-    """
-    plan, biped = model.plan, model.biped
-    pelvis = np.array(plan.pelvis[row])
-    pelvis[:, :2] += shift
-    target = within_reach(biped.leg, plan.ankles[row] - pelvis[:, None] - biped.hips)
-    level = np.broadcast_to(np.eye(3), (*target.shape, 3))
-    q = leg_angles(biped.leg, target, level).reshape(len(shift), -1)
-    return np.where((shift != 0.0).any(axis=1, keepdims=True), q - plan.q[row], 0.0)
+    @classmethod
+    def of(cls, model: WalkerModel) -> "Stances":
+        """Those of the assumed walker and its plan."""
+        plan, leg, size = model.plan, model.biped.leg, len(model.plan.q)
+        legs = np.array([(leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)], kernels.LEGS)
+        rows = np.zeros(size, kernels.STANCE)
+        rows["pelvis"], rows["ankles"], rows["q"] = plan.pelvis, plan.ankles, plan.q.reshape(size, 2, -1)
+        return cls(legs, rows)
 
 
 def within_reach(leg: LegGeometry, ankle: Array) -> Array:
@@ -110,6 +105,7 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     Returns:
         (T, 12) [rad].
     """
-    plan = model.plan
-    shift = center_of_mass_shift(zmp, plan.omega, model.control_period_s)
-    return pelvis_shift_offsets(model, slice(None), shift)
+    stances, offsets = Stances.of(model), np.zeros((len(zmp), len(model.joint_names)))
+    shift = center_of_mass_shift(zmp, model.plan.omega, model.control_period_s)
+    kernels.move_pelvis_in_rows(stances.legs, stances.rows, shift, offsets)
+    return offsets
