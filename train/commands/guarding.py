@@ -72,7 +72,7 @@ class Speed:
     seconds: float = 60.0
     """How long, with --real-time [s]."""
     output: Path | None = None
-    """Folder for speed.json or real_time.json, new or empty; default runs/speed, numbered if taken."""
+    """Folder for speed.json and speed.csv, or real_time.json, new or empty; default runs/speed, numbered if taken."""
 
     def run(self) -> None:
         """Measure and report."""

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from elastic_env.core.config import Model, quantity
 from train.evaluate.environments import environment
+from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
 from train.speed.contenders import (
@@ -170,7 +171,7 @@ def profile(config: SpeedConfig) -> str:
 
 
 def measure_all(config: SpeedConfig, console: Console, output: Path | None = None, with_profile: bool = False) -> Path:
-    """Measure, print the ratios, and write them as JSON.
+    """Measure, print the ratios, and write them as JSON and CSV.
 
     Args:
         config: What to measure.
@@ -194,6 +195,7 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
         results = measure(config, plain_progress(console))
         path = folder / "speed.json"
         path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
+        write_records([asdict(r) for r in results], folder / "speed.csv")
         if with_profile:
             text = profile(config)
             (folder / "profile.txt").write_text(text)

@@ -18,7 +18,7 @@ from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
 from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
-from train.report.pages import arms, joints, walks
+from train.report.pages import arms, joints, speeds, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
 from train.report.pages.learned import ARM, CEILINGS, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
@@ -49,6 +49,11 @@ TABLES = {
         kept.table or name: f"python -m train.report.pages.keep writes it from a run of configs/{name}.yaml"
         for name, kept in KEPT.items()
     },
+    **{
+        f"speed_{env}": f"copy it from speed.csv after `elastic speed --env {env} --num-envs 64 1 16 256 1024`"
+        for env in ("walker", "testbed")
+    },
+    "cluster": "python -m tests.cluster_trials measures it",
     "step": "python -m train.experiments.pages.step writes it",
     **dict.fromkeys(
         ("identification", "output_compensator", "gravity_torque"),
@@ -180,6 +185,10 @@ PARTS: Mapping[str, Part] = {
     "learned at 1.6 s": _of(changes_table, "learned_walker_1600ms"),
     "learned on other bases": _of(changes_table, "learned_walker_bases"),
     "ceilings of learning": _of(partial(changes_table, metrics=CEILINGS), "learned_ceilings"),
+    "speed of vector environments": _of(speeds.vector_environments, "speed_walker", "speed_testbed"),
+    "speed of other ways": _of(speeds.other_ways, "speed_walker", "speed_testbed"),
+    "costs of cells": _of(speeds.costs_of_cells, "cluster"),
+    "policies alone": _of_standings(speeds.policies_alone),
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
     "errors of the IMU": _of(walks.imu_errors, "walker_imu"),
     "gravity torques": _of(walks.gravity_torques, "gravity_torque"),

@@ -1,0 +1,67 @@
+"""Tables of what a step costs, from the `speed.csv` that `elastic speed` wrote and from the leaderboard."""
+
+from collections.abc import Sequence
+
+from train.evaluate.evaluate import grouped
+from train.evaluate.leaderboard import Standing
+from train.report.pages.cells import Rows
+from train.runs.escaping import markdown_table
+
+_RAW, _OURS = "raw mj_step", "vector env"
+
+
+def vector_environments(*tables: Rows) -> str:
+    """Time of raw physics per world and control step, and how fast the vector environment is beside it."""
+    lines = []
+    rows = [row for table in tables for row in table if row["against"] == f"{_RAW}, {row['num_envs']}"]
+    rows = sorted(rows, key=lambda row: int(row["num_envs"]))
+    for (env, worlds), own in sorted(grouped(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot):
+        ratios = [f"{float(row['ratio']):.2f}" for row in own if row["contender"].startswith(_OURS)]
+        (raw, *_) = (row for row in own if row["contender"] == _RAW)
+        if ratios:  # the scalar environment has raw physics of its own
+            lines.append([env, worlds, f"{1e6 / float(raw['steps_per_s']):.0f}", *ratios])
+    head = ["", "worlds", "raw [µs]", "environment / raw", "with policy / raw", "with policy and network / raw"]
+    return markdown_table(head, ["---", *["---:"] * 5], lines) + "\n"
+
+
+def _robot(place: tuple[tuple[str, ...], Rows]) -> str:
+    return place[0][0]
+
+
+def other_ways(*tables: Rows) -> str:
+    """Scalar environments under other vector environments, and PPO end to end."""
+    rows = [row for table in tables for row in table if not row["against"].startswith(_RAW)]
+    lines = [
+        [
+            row["env"],
+            row["contender"],
+            row["num_envs"],
+            f"{float(row['steps_per_s']):.0f}",
+            f"{float(row['ratio']):.2f}",
+        ]
+        for row in rows
+    ]
+    against = sorted({row["against"] for row in rows if not row["contender"].startswith("PPO")})
+    head = ["", "", "worlds", "control steps/s", f"ratio to {' and '.join(against)}; of PPO to the first of them"]
+    return markdown_table(head, ["---", "---", *["---:"] * 3], lines) + "\n"
+
+
+def costs_of_cells(rows: Rows) -> str:
+    """What it takes to hand out a cell, and what a kill costs, from `tests.cluster_trials`."""
+    lines = []
+    for row in rows:
+        what = f"{float(row['count']):,.0f}".replace(",", " ") + f" × {row['trial']}"
+        if row["dask_to_local"]:
+            each = f"{float(row['local_ms']):.4g} ms each", f"{float(row['dask_ms']):.4g} ms each"
+            lines.append([what, *each, f"{float(row['dask_to_local']):.3f}"])
+        else:
+            again = f"at most {row['played_again_most']} cells began again"
+            lines.append([what, "–", f"{row['identical']} complete and identical; {again}", "–"])
+    return markdown_table(["trial", "on this machine", "on dask", "dask / local"], ["---", *["---:"] * 3], lines) + "\n"
+
+
+def policies_alone(standings: Sequence[Standing]) -> str:
+    """What `predict` takes for one world of the walker, as it was measured with the leaderboard."""
+    took = sorted({s.policy: s.step_us for s in standings}.items(), key=lambda own: own[1])
+    lines = [[policy, f"{step_us:.0f}"] for policy, step_us in took]
+    return markdown_table(["policy", "`predict` [µs]"], ["---", "---:"], lines) + "\n"
