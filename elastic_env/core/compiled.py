@@ -30,8 +30,8 @@ _said_of: dict[Any, str] = {}
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorate a function of arrays and numbers; its own Python code is the attribute `py_func`."""
-    # as in NumPy, what is divided by zero is infinite or nan
-    options: dict[str, Any] = {"error_model": "numpy"}
+    # as in NumPy, what is divided by zero is infinite or nan; nobody calls it from C, which saves some compiling
+    options: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
     _said_of[function] = _KEPT
     try:
         return numba.njit(cache=True, **options)(function)
