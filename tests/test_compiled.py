@@ -34,6 +34,7 @@ KERNELS = (
     "elastic_env.dynamics.tree.kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.tree.end_effector",
     "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
     "baselines.estimation.estimation_kernels", "baselines.adaptation.adaptation_kernels",
+    "baselines.residual.residual_kernels",
 )  # fmt: skip
 
 

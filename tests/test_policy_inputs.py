@@ -12,7 +12,8 @@ import pytest
 
 import baselines
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
-from baselines.compensation.inputs import INPUTS, PolicyInputs, input_signals, inputs_of, shifted_share
+from baselines.compensation.compensation_kernels import shifted_share
+from baselines.compensation.inputs import INPUTS, PolicyInputs, input_signals, inputs_of
 from baselines.policies import sensors_needed
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
@@ -189,9 +190,9 @@ def test_two_feet_share_a_shifted_zmp_by_the_lever() -> None:
     share, spacing, p = np.array([0.0, 0.5, 1.0]), 0.2, 0.01
     left, right = 0.5 * spacing, -0.5 * spacing
     before = (1.0 - share) * left + share * right
-    moved = shifted_share(share, np.full(3, p), spacing)
+    moved = np.array([shifted_share(planned, p, spacing) for planned in share])
     np.testing.assert_allclose((1.0 - moved) * left + moved * right - before, [0.0, p, 0.0], atol=1e-15)
-    np.testing.assert_array_equal(shifted_share(np.array([0.01]), np.array([0.05]), spacing) >= 0.0, [True])
+    assert shifted_share(0.01, 0.05, spacing) >= 0.0
 
 
 def test_the_force_difference_control_wants_the_shifted_loads() -> None:

@@ -176,7 +176,8 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
 
     def acting(**settings: Any) -> dict[str, float]:
         channels = Channels(model, ResidualSettings(**settings))
-        assert channels.wanted(np.ones((1, len(channels.signals)))).tolist() == [channels.bounds.tolist()]
+        all_of_it = channels.towards(np.zeros((1, channels.width)), np.ones((1, len(channels.signals))), 1.0)
+        assert all_of_it.tolist() == [channels.bounds.tolist()]
         columns = [signal.name for name in settings["acts_on"] for signal in input_signals(name, model)]
         return {name: bound for name, bound in zip(columns, channels.bounds.tolist(), strict=True) if bound}
 

@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from baselines.compensation.compensation_kernels import shift_seen
 from baselines.compensation.compensators import Compensator
-from baselines.compensation.inputs import DEFLECTION, PolicyInputs, inputs_of, shifted_share
+from baselines.compensation.inputs import DEFLECTION, PolicyInputs, inputs_of
+from baselines.compensation.observed import ObservedWalk
 from baselines.compensation.policy import Action, ObservationView, Policy, PolicyWithInputs, predicted, taken_up
 from baselines.compensation.startup import Ramp
 from elastic_env.core.signals import Array
@@ -43,8 +45,7 @@ class Compensated(PolicyWithInputs):
         self._ramp = Ramp(model, ramp_s)
         self._plan = None
         if isinstance(model, WalkerModel):
-            table = model.observation_table
-            self._plan = table.group("load_share"), table.group("zmp_reference"), model.biped.foot_spacing
+            self._plan = ObservedWalk(model.observation_table), model.biped.foot_spacing
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -92,9 +93,8 @@ class Compensated(PolicyWithInputs):
         shift = inputs.zmp_shift
         if shift is None or self._plan is None:
             return rows
-        rows, (share, zmp, spacing) = rows.copy(), self._plan
-        rows[:, zmp] += shift
-        rows[:, share] = shifted_share(rows[:, share], shift[:, 1:], spacing)
+        rows, (observed, spacing) = rows.copy(), self._plan
+        shift_seen(observed.fields(rows), np.ascontiguousarray(shift), spacing)
         return rows
 
     def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:

@@ -74,6 +74,57 @@ def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
 
 
 @compiled
+def shift_seen(observed: Any, shift: Array, spacing: float) -> None:
+    """Shift the plan's ZMP in observations, in place, and its load share with it.
+
+    Args:
+        observed: Observations, rows with fields, (n,).
+        shift: Of the ZMP, x forward and y left, (n, 2) [m].
+        spacing: Distance of the feet [m].
+    """
+    for world in range(len(observed)):
+        shown = observed[world]
+        for i in range(2):
+            shown.zmp_reference[i] += shift[world, i]
+        shown.load_share = shifted_share(shown.load_share, shift[world, 1], spacing)
+
+
+@compiled
+def shifted_shares(observed: Any, planned: Array, period_s: float, shift: Array, spacing: float, found: Array) -> None:
+    """Load shares of the right foot at the end of the last control period, under a ZMP that is shifted.
+
+    Args:
+        observed: Observations, rows with fields, (n,).
+        planned: Shares of the plan, one per control step.
+        period_s: Control period [s].
+        shift: Of the ZMP, x forward and y left, (n, 2) [m].
+        spacing: Distance of the feet [m].
+        found: To be filled, (n,).
+    """
+    for world in range(len(found)):
+        row = int(min(max(np.rint(observed[world].clock[0] / period_s) - 1.0, 0.0), len(planned) - 1.0))
+        found[world] = shifted_share(planned[row], shift[world, 1], spacing)
+
+
+@compiled
+def shifted_share(share: float, shift_y: float, spacing: float) -> float:
+    """Load share of the right foot under a ZMP that is shifted to the left.
+
+    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot that stands takes
+    over, whose ankle carries the shift, so that the change fades with 4 μ (1 − μ).
+
+    Args:
+        share: Planned share μ.
+        shift_y: Shift p [m].
+        spacing: Distance w of the feet [m].
+    """
+    shifted = share - 4.0 * share * (1.0 - share) * shift_y / spacing
+    if shifted > 1.0:
+        return 1.0
+    return 0.0 if shifted < 0.0 else shifted
+
+
+@compiled
 def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) -> None:
     """Loads by the foot wrenches.
 

@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from elastic_env.core.signals import Array, Mirrored, Signal
 from elastic_env.runtime.robot_model import RobotModel
 
@@ -118,18 +116,3 @@ NO_INPUTS = PolicyInputs()
 def inputs_of(policy: Any) -> tuple[str, ...]:
     """Names of the inputs that a policy has."""
     return (COMMAND, *getattr(policy, "inputs", ()))
-
-
-def shifted_share(share: Array, shift_y: Array, spacing: float) -> Array:
-    """Load share of the right foot under a ZMP that is shifted to the left.
-
-    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot that stands takes
-    over, whose ankle carries the shift, so that the change fades with 4 μ (1 − μ).
-
-    Args:
-        share: Planned share μ, (...).
-        shift_y: Shift p, (...) [m].
-        spacing: Distance w of the feet [m].
-    """
-    shifted = share - 4.0 * share * (1.0 - share) * shift_y / spacing
-    return np.minimum(np.maximum(shifted, 0.0), 1.0)  # as np.clip, which takes long for one world

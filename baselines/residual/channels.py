@@ -3,6 +3,7 @@
 import numpy as np
 
 from baselines.compensation.inputs import COMMAND, INPUTS, InputKind, PolicyInputs, input_signals
+from baselines.residual.residual_kernels import approach
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal
@@ -40,8 +41,11 @@ class Channels:
             bounds.append(of_input)
             self._ends.append(self._ends[-1] + len(of_input))
         self.bounds = np.concatenate(bounds)
-        self._columns, self._source = np.flatnonzero(self.bounds), np.concatenate(sources).astype(np.int64)
-        self._acting_bounds = self.bounds[self._columns]
+        self._source = np.full(len(self.bounds), -1, dtype=np.int64)
+        self._source[np.flatnonzero(self.bounds)] = np.concatenate(sources)
+        spans = dict(zip(self._names, map(slice, self._ends, self._ends[1:]), strict=False))
+        self._command = spans.pop(COMMAND, None)
+        self._spans = [spans.get(name) for name in PolicyInputs._fields]
         self.signals = tuple(_renamed(signal, name) for name, signal in signals.items())
 
     @property
@@ -49,11 +53,20 @@ class Channels:
         """Columns of all inputs."""
         return len(self.bounds)
 
-    def wanted(self, residual: Array) -> Array:
-        """Values of all columns for a residual within [−1, 1], (num_worlds, k) to (num_worlds, width)."""
-        values = np.zeros((len(residual), self.width))
-        values[:, self._columns] = self._acting_bounds * residual[:, self._source]
-        return values
+    def towards(self, values: Array, residual: Array, share: float) -> Array:
+        """Values of all columns after a share of their way to what a residual wants, (num_worlds, width).
+
+        Args:
+            values: Before.
+            residual: Within [−1, 1], (num_worlds, k).
+            share: 1 for all of the way.
+        """
+        now = np.empty((len(residual), self.width))
+        approach(
+            np.ascontiguousarray(values), np.ascontiguousarray(residual, dtype=np.float64), self._source, self.bounds,
+            share, now,
+        )  # fmt: skip
+        return now
 
     def parts(self, values: Array) -> dict[str, Array]:
         """Values by input, (..., width) to (..., columns of the input)."""
@@ -62,9 +75,8 @@ class Channels:
 
     def inputs(self, values: Array) -> tuple[PolicyInputs, Array | None]:
         """Values as inputs of a base policy, and as an offset of its command, if there is one [rad]."""
-        parts = self.parts(values)
-        offset = parts.pop(COMMAND, None)
-        return PolicyInputs(**parts), offset
+        inputs = PolicyInputs._make([None if span is None else values[:, span] for span in self._spans])
+        return inputs, None if self._command is None else values[:, self._command]
 
 
 def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Array:

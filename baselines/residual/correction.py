@@ -65,7 +65,7 @@ class Corrected:
         values, inner = taken_up(
             state, episode_start, rows, self._view, lambda: np.zeros((len(rows), self.channels.width))
         )
-        values = values + self._share * (self.channels.wanted(residual) - values)
+        values = self.channels.towards(values, residual, self._share)
         inputs, offset = self.channels.inputs(values)
         action, inner = predicted(self.base, observation, inputs, inner, episode_start, True)
         if offset is not None:

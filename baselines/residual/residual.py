@@ -17,6 +17,7 @@ from baselines.residual.correction import Corrected
 from baselines.residual.evidence import caution
 from baselines.residual.features import Features
 from baselines.residual.network import Network, Tensors
+from baselines.residual.residual_kernels import count_due, count_step
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError
@@ -136,9 +137,9 @@ class ResidualPolicy:
         """Corrected action and new state."""
         rows = self._view.rows(observation)
         memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._undecided(len(rows)))
-        due = np.flatnonzero((memory[:, 0] == 0.0) | (memory[:, 0] == _UNDECIDED))
-        if len(due) > 0:
-            memory = memory.copy()
+        memory = memory.copy()
+        if count_due(memory) > 0:
+            due = np.flatnonzero(memory[:, 0] <= 0.0)
             fresh = memory[:, 0] == _UNDECIDED
             _, _, past, known = np.split(memory, self._ends, axis=1)
             features, past = self._features.at(rows, past, fresh, inner, episode_start)
@@ -147,9 +148,8 @@ class ResidualPolicy:
             memory[due] = np.hstack([np.zeros((len(due), 1)), decided, past[due], known[due]])
         residual = memory[:, self._ends[0] : self._ends[1]]
         action, inner = self.corrected.act(observation, residual, inner, episode_start)
-        counted = memory.copy()
-        counted[:, 0] = (memory[:, 0] + 1.0) % self._period
-        return action, (counted, inner)
+        count_step(memory, self._period)
+        return action, (memory, inner)
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """See `Corrected`."""

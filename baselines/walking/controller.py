@@ -25,14 +25,14 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compensation.inputs import PolicyInputs, shifted_share
+from baselines.compensation.compensation_kernels import shifted_shares
+from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.observed import ObservedWalk, Records
 from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
 from baselines.walking import walking_kernels as kernels
-from baselines.walking.posture import hip_offsets
 from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array
 from elastic_env.dynamics.biped import Biped
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.runtime.robot_model import WalkerModel
@@ -105,16 +105,16 @@ class WalkingController(PolicyWithInputs):
         gains: WalkingGains | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
-        self._biped, self._plan = model.biped, model.plan
+        self._biped, plan = model.biped, model.plan
         table = model.observation_table
         self._view, self._observed = ObservationView(table, model.control_period_s), ObservedWalk(table)
-        self._attitude, self._clock = table.group("imu_attitude"), table.group("clock")
-        self._dt, steps = model.control_period_s, max(round(ramp_s / model.control_period_s), 1)
+        self._attitude, steps = table.group("imu_attitude"), max(round(ramp_s / model.control_period_s), 1)
         self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
         self._constants: Any = np.array([_constants(model, com_feedback, gains or WalkingGains())], kernels.CONTROLLER)
-        self._plan_rows: Any = np.zeros(self._plan.num_steps + 1, kernels.PLAN)
+        self._plan_rows: Any = np.zeros(plan.num_steps + 1, kernels.PLAN)
         for name in kernels.PLAN.names or ():
-            self._plan_rows[name] = getattr(self._plan, name)
+            self._plan_rows[name] = getattr(plan, name)
+        self._planned_shares, self._period_s = np.ascontiguousarray(plan.share), model.control_period_s
         self._stances, self._sole = Stances.of(model), _sole(self._biped)
 
     @property
@@ -140,8 +140,8 @@ class WalkingController(PolicyWithInputs):
         memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(LocalFrame(com, soles)))
         kept, action = np.empty(memory.shape), np.empty((n, 12))
         before, now = self._fields(memory), self._fields(kept)
-        shares = _NO_SHARES if inputs.zmp_shift is None else self._shifted_shares(rows, inputs.zmp_shift)
-        seen = self._observed.fields(rows), com, soles, shares
+        observed = self._observed.fields(rows)
+        seen = observed, com, soles, self._shares(observed, inputs.zmp_shift)
         walk = self._constants, self._plan_rows, *self._stances, self._ramp
         kernels.control(walk, seen, _dense(inputs, n), before, now, action)
         return action.astype(np.float32).reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
@@ -161,14 +161,13 @@ class WalkingController(PolicyWithInputs):
         """Memory, (num_worlds, 15), as rows with fields."""
         return np.ndarray(len(memory), kernels.MEMORY, np.ascontiguousarray(memory))
 
-    def _row(self, rows: Array) -> IntArray:
-        """Rows of the plan at the ends of the last control periods, (num_worlds,)."""
-        row = np.rint(rows[:, self._clock.start] / self._dt).astype(np.int64) - 1
-        return np.minimum(np.maximum(row, 0), self._plan.num_steps)
-
-    def _shifted_shares(self, rows: Array, shift: Array) -> Array:
-        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]."""
-        return shifted_share(self._plan.share[self._row(rows)], shift[:, 1], self._biped.foot_spacing)
+    def _shares(self, observed: Records, shift: Array | None) -> Array:
+        """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for those of the plan."""
+        if shift is None:
+            return _NO_SHARES
+        shares, spacing = np.empty(len(observed)), self._biped.foot_spacing
+        shifted_shares(observed, self._planned_shares, self._period_s, np.ascontiguousarray(shift), spacing, shares)
+        return shares
 
 
 _NO_SHARES: Array = np.empty(0)
@@ -207,7 +206,7 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     if inputs.balance_gain is not None:
         dense["balance_gain"] = inputs.balance_gain[:, 0]
     if inputs.hip is not None:
-        dense["offset"] = hip_offsets(inputs.hip).reshape(-1, 2, 6)
+        dense["hip"] = inputs.hip if inputs.hip.ndim == 3 else inputs.hip[:, None]
     if inputs.deflection is not None:
         dense["deflection"] = inputs.deflection.reshape(-1, 2, 6)
     return dense

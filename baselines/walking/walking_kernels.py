@@ -58,7 +58,7 @@ MEMORY = _row_type(
 
 INPUTS = _row_type(
     ("zmp", np.float64, (2,)), ("com", np.float64, (2,)),  # [m]
-    ("leg_length", np.float64), ("offset", np.float64, (2, 6)),  # [m], [rad]
+    ("leg_length", np.float64), ("hip", np.float64, (2, 2)),  # [m], roll and pitch of either leg [rad]
     ("balance_gain", np.float64), ("deflection", np.float64, (2, 6)),  # relative changes [1]
 )  # fmt: skip
 """What something outside adds; zeros are as if there were none, to the last bit."""
@@ -256,8 +256,10 @@ def offset_leg(controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp
     for i in range(6):
         wound = 1.0 + given.deflection[leg, i]
         moved = 0.0
-        if i == 2:
-            moved = hip
+        if i == 1:
+            moved = given.hip[leg, 0]
+        elif i == 2:
+            moved = hip + given.hip[leg, 1]
         elif i == 3:
             moved = knee
         elif i == 4:
@@ -266,7 +268,7 @@ def offset_leg(controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp
             moved = wound * roll
         rate = shown.reference_rate[first + i] / controller.friction_rate_rad_s
         against_friction = wound * (controller.friction_deflection[leg, i] * math.tanh(rate))
-        action[first + i] = ramp * (moved + given.offset[leg, i]) + against_friction
+        action[first + i] = ramp * moved + against_friction
 
 
 @compiled
