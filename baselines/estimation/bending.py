@@ -31,6 +31,8 @@ _UNKNOWNS = 2  # ρ and c
 _SHAPE = (2, 2)  # legs, roll and pitch
 _FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"))
 _VARIANCES = 12  # per world: (legs, axes, upper triangle)
+_PRIOR: Array = np.tile(np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2, 4)
+"""The variances before the first measurement."""
 
 
 class BendingObserver:
@@ -64,8 +66,7 @@ class BendingObserver:
     def begin(self, num_worlds: int) -> Array:
         """Memory before the first measurement, (num_worlds, memory_width)."""
         memory = np.zeros((num_worlds, self.memory_width))
-        prior = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
-        memory[:, -_VARIANCES:] = np.tile(prior, 4)
+        memory[:, -_VARIANCES:] = _PRIOR
         return memory
 
     def observe(self, rows: Array, memory: Array, bending: Array | None = None) -> tuple[Array, Array]:
