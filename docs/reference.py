@@ -6,16 +6,17 @@ import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import get_args
 
 import gymnasium
 
 from elastic_env import IDS
 from elastic_env.core.signals import Signal
 from elastic_env.runtime.scenario import scenario_names
-from train.commands.cli import main
+from train.commands.cli import Command, main
 
-COMMANDS = ("identify", "evaluate", "compare", "train", "iterate", "export", "bench", "speed", "play", "demo")
-"""Commands whose help is shown; that of `hardware` stands in its parts."""
+COMMANDS = [command.__metadata__[0].name for command in get_args(Command)]
+"""All commands; the help of `hardware` stands in its parts."""
 HARDWARE = ("scan", "check", "run", "emulate")
 
 
@@ -73,7 +74,10 @@ def help_of(*words: str) -> str:
 def commands_page() -> str:
     """`--help` of every command."""
     parts = ["# Commands: help", "Output of `--help`. [Commands](../commands.md) has examples and durations."]
-    for words in [*((command,) for command in COMMANDS), *(("hardware", part) for part in HARDWARE)]:
+    for words in [
+        *((command,) for command in COMMANDS if command != "hardware"),
+        *(("hardware", part) for part in HARDWARE),
+    ]:
         parts += [f"## elastic {' '.join(words)}", f"```text\n{help_of(*words)}\n```"]
     return "\n\n".join(parts) + "\n"
 

@@ -12,12 +12,15 @@ import gymnasium
 from elastic_env.rendering.headless import prefer_egl
 
 if TYPE_CHECKING:
+    from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError
     from elastic_env.joint.elasticity import ElasticJoint, Servo
     from elastic_env.joint.make_elastic import make_elastic
     from elastic_env.robots.joint_robot import JointRobot
 
 __version__ = "0.1.0"
-__all__ = ["IDS", "ElasticJoint", "JointRobot", "Servo", "make_elastic"]
+__all__ = [
+    "IDS", "ActionError", "ConfigurationError", "ElasticError", "ElasticJoint", "JointRobot", "Servo", "make_elastic",
+]  # fmt: skip
 
 _ENVIRONMENTS = (
     "elastic_env.robots.testbed", "elastic_env.robots.thormang", "elastic_env.robots.robot",
@@ -26,6 +29,9 @@ _ENVIRONMENTS = (
 """Packages that say NAME and ID of an environment, and make it in a module `environment`."""
 
 _HOMES = {
+    "ActionError": "elastic_env.core.errors",
+    "ConfigurationError": "elastic_env.core.errors",
+    "ElasticError": "elastic_env.core.errors",
     "ElasticJoint": "elastic_env.joint.elasticity",
     "JointRobot": "elastic_env.robots.joint_robot",
     "Servo": "elastic_env.joint.elasticity",

@@ -332,3 +332,14 @@ def test_a_load_that_overcomes_a_spring_is_said() -> None:
     weak.set_payload(5.0)
     with pytest.raises(ElasticError, match=re.escape("stiffness of shoulder (1.5 N·m/rad) too low")):
         weak.link_angle(np.zeros(3))
+
+
+def test_servos_of_the_model_that_give_way_are_named() -> None:
+    """Catches a sag that stays because nobody said k_p; an infinite one says that the servo holds its angle."""
+    actuators = '<actuator><position joint="elbow" kp="40" gear="2"/><motor joint="turn"/></actuator>'
+    model = ARM.replace("</mujoco>", f"{actuators}</mujoco>")
+    spec = mujoco.MjSpec.from_string(model)
+    with pytest.warns(UserWarning, match=re.escape("position_gain={elbow: 160} [N·m/rad], or position_gain=math.inf")):
+        alone = PositionCompensator.from_model(spec, 500.0)
+    held = PositionCompensator.from_model(spec, 500.0, position_gain=math.inf)
+    np.testing.assert_array_equal(alone.command([0.3, 0.2, 0.1]), held.command([0.3, 0.2, 0.1]))

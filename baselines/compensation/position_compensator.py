@@ -9,6 +9,7 @@ inertia, a payload, springs of the model's joints; `gravcomp` of its bodies lowe
 are not in it. What a motor encoder shows is turned into the link angle by Eq. 10.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -52,7 +53,8 @@ class PositionCompensator:
             has `stiffness`. A name goes before patterns, and a later pattern before an earlier one.
         joints: Hinges that are commanded, in the order of the arrays; None for all in the order of the model. The other
             joints are held where the model's first keyframe has them, or at its reference.
-        position_gain: k_p of servos that give way under a load [N·m/rad]; None for servos that hold their angle.
+        position_gain: k_p of servos that give way under a load [N·m/rad]; None or infinite for servos that hold their
+            angle. Where the model has position actuators and it is None, a warning says their k_p.
         limit_rad: Largest offset between command and desired angle [rad].
         ramp_s: Time in which offsets grow from zero after the start, and in which a payload is taken over [s].
         period_s: Time between two commands, for the ramp [s].
@@ -85,7 +87,9 @@ class PositionCompensator:
             _require_patterns_that_fit(given, [*self.joints, *held])
         self._compliance = 1.0 / _per_joint("stiffness", stiffness, self.joints)
         self._of_command = self._compliance.copy()
-        if position_gain is not None:
+        if position_gain is None:
+            _warn_of_servos(model, self.joints)
+        else:
             self._of_command += 1.0 / _per_joint("position_gain", position_gain, self.joints)
         self._limit, self._ramp = _number("limit_rad", limit_rad, "rad"), _number("ramp_s", ramp_s, "s", least=0.0)
         self._steps = max(int(np.ceil(self._ramp / _number("period_s", period_s, "s"))), 1)
@@ -296,6 +300,24 @@ def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> N
             )
     if model.tendon_stiffness.any() or model.tendon_stiffnesspoly.any():
         raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
+
+
+def _warn_of_servos(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+    """Warn where the model has position actuators, which give way under a load, at joints that are commanded."""
+    gains = {}
+    for i in range(model.nu):
+        joint = int(model.actuator_trnid[i, 0])
+        is_at_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT and model.joint(joint).name in joints
+        kp, is_pid = -float(model.actuator_biasprm[i, 1]), model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_PID
+        if is_at_joint and kp > 0.0 and not is_pid:
+            gains[model.joint(joint).name] = float(model.actuator_gear[i, 0]) ** 2 * kp
+    if gains:
+        given = ", ".join(f"{name}: {kp:g}" for name, kp in gains.items())
+        warnings.warn(
+            f"the model has position servos that give way under a load, which is not compensated; give "
+            f"position_gain={{{given}}} [N·m/rad], or position_gain=math.inf for servos that hold their angle",
+            stacklevel=4,
+        )
 
 
 def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:

@@ -180,7 +180,8 @@ class PoseModel:
                 return q, inverse
         raise ElasticError(
             "no link angles for these poses: gravity overcomes the springs that the log implies; check signs, zeros, "
-            "units and frame (--frame) of its columns, and the masses of the model"
+            "units and frame (--frame) of its columns, the point that was measured (--end-effector), and the masses of "
+            "the model"
         )
 
     def predicted(self, unknowns: Array) -> tuple[Array, Array]:

@@ -366,7 +366,7 @@ def _placed_table(placed: Sequence[Placed]) -> Table:
 
 
 def _shares_table(shares: Sequence[JointShare]) -> Table:
-    caption = "closed form over the static poses, uncompensated; F/K is what friction can leave"
+    caption = "closed form, uncompensated: springs and servos that give way; F/K is what friction can leave"
     table = Table(
         title="where the error at rest comes from", caption=caption, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )

@@ -37,7 +37,14 @@ TABLES = {
     "gallery": "python -m train.experiments.gallery writes it",
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
-        for name in ("learned_posture", "learned_robot", "learned_testbed", "learned_walker", "learned_walker_1600ms")
+        for name in (
+            "learned_posture",
+            "learned_posture_1600ms",
+            "learned_robot",
+            "learned_testbed",
+            "learned_walker",
+            "learned_walker_1600ms",
+        )
     },
     **dict.fromkeys(
         ("learned_walker_bases", "learned_ceilings"),
@@ -179,6 +186,7 @@ PARTS: Mapping[str, Part] = {
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned posture": _of(changes_table, "learned_posture"),
+    "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
     "learned on the testbed": _of(changes_table, "learned_testbed"),
     "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
     "learned on the walker": _of(changes_table, "learned_walker"),
