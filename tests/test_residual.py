@@ -4,6 +4,7 @@ import json
 import math
 import re
 import subprocess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -479,7 +480,8 @@ def test_residuals_that_come_with_the_package_are_found_by_name(
     """Catches a name that only works in the source tree, and a folder that was damaged or left out."""
     monkeypatch.chdir(tmp_path)
     robot = read_description(Path(name)).robot
-    policy: Any = baselines.make(f"residual:{name}", scalar(robot))
+    arm = partial(gymnasium.make, "elastic_env/Robot-v0", sensors=["link_encoder"])
+    policy: Any = baselines.make(f"residual:{name}", arm() if robot == "robot" else scalar(robot))
     assert policy.corrected.settings == read_description(Path(name)).settings
 
 

@@ -24,6 +24,7 @@ from train.workers.places import Place
 
 RESIDUALS = {
     "testbed": "learned_testbed",
+    "robot": "learned_robot",
     "walker_3s": "learned_walker",
     "walker_1600ms": "learned_walker_1600ms",
     "walker_3s_posture": "learned_posture",
