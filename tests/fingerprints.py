@@ -30,7 +30,7 @@ from elastic_env.runtime.scenario import scenario_names
 RECORDED = Path(__file__).with_name("fingerprints.json")
 STEPS, WORLDS = 300, 7
 POLICIES = {"testbed": ON_JOINTS, "walker": ON_THE_WALKER}
-RESIDUALS = {"testbed": ("testbed/seed_0",), "walker": ("walker_3s/seed_0", "walker_1600ms/seed_0")}
+RESIDUALS = {"testbed": ("testbed/seed_0",), "walker": ("walker_3s/seed_0", "walker_1600ms_posture/seed_0")}
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ RESIDUALS = {
     "testbed": "learned_testbed",
     "robot": "learned_robot",
     "walker_3s": "learned_walker",
-    "walker_1600ms": "learned_walker_1600ms",
     "walker_3s_posture": "learned_posture",
     "walker_1600ms_posture": "learned_posture_1600ms",
 }

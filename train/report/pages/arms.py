@@ -1,5 +1,7 @@
 """Tables of arms: how far one sags, and what encoders on its links are worth."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.stats import bootstrap
 
@@ -51,3 +53,28 @@ def _change(base: Array, other: Array, axis: int = -1) -> Array:
 
 def _percent(value: float | Array) -> str:
     return minus(f"{100.0 * float(value):+.0f}") + " %"
+
+
+def arm_identification(rows: Rows) -> str:
+    """How well the stiffness of an arm is found over many logs of known truth, from `tests.identification_trials`."""
+    kinds = grouped(rows, lambda row: (row["poses"], row["log"]))
+    joints = grouped(rows, lambda row: row["joint"])
+    head = ["", *(f"{poses} poses, {log}" for poses, log in kinds)]
+    counted = [[f"`{joint}`", *(_counted(row) for row in own)] for joint, own in joints.items()]
+    arm = [own[0] for own in kinds.values()]
+    errors = [
+        ["**error before [mm]**", *(f"{1e3 * float(row['before_median_m']):.1f}" for row in arm)],
+        ["**error after [mm], median, largest**", *(_two(row, "after_median_m", "after_most_m") for row in arm)],
+    ]
+    return markdown_table(head, ["---", *["---:"] * len(kinds)], [*counted, *errors]) + "\n"
+
+
+def _counted(row: Mapping[str, str]) -> str:
+    half_width = 100.0 * float(row["half_width_median"])
+    wide = f"± {half_width:.2g} %" if half_width < 100.0 else "no upper end"
+    holds, within, told = (round(float(row[name])) for name in ("holds", "within", "told_apart"))
+    return f"{holds}; {f'{within} of {told}' if told else '–'}; {wide}"
+
+
+def _two(row: Mapping[str, str], *names: str) -> str:
+    return ", ".join(f"{1e3 * float(row[name]):.2f}" for name in names)

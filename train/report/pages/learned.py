@@ -13,14 +13,11 @@ from train.report.pages.cells import Rows
 from train.runs.escaping import markdown_table
 
 _METRICS = {
-    "pelvis_error_rms_rad": ("pelvis error", "mrad"), "pelvis_roll_rms_rad": ("roll", "mrad"),
-    "pelvis_pitch_rms_rad": ("pitch", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm"),
+    "pelvis_error_rms_rad": ("pelvis error", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm"),
     "link_error_rms_rad": ("link error", "mrad"), "end_effector_error_rms_m": ("end effector error", "mm"),
 }  # fmt: skip
 """Metrics that pages show, with the unit of their tables."""
 _JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
-CEILINGS = ("pelvis_roll_rms_rad", "pelvis_pitch_rms_rad", "zmp_deviation_rms_m")
-"""Metrics of the residuals that are trained and scored on one walk."""
 ARM = ("end_effector_error_rms_m", "link_error_rms_rad")
 """Metrics of an arm."""
 MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")

@@ -20,7 +20,7 @@ from train.figures.step_picture import step_svg
 from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
 from train.report.pages import arms, joints, speeds, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
-from train.report.pages.learned import ARM, CEILINGS, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
+from train.report.pages.learned import ARM, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -43,13 +43,8 @@ TABLES = {
             "learned_robot",
             "learned_testbed",
             "learned_walker",
-            "learned_walker_1600ms",
         )
     },
-    **dict.fromkeys(
-        ("learned_walker_bases", "learned_ceilings"),
-        "copy it from statistics.csv after the comparison in docs/learned.md of policies that you have trained",
-    ),
     "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
     "drawn_robots": "copy it from robots.csv after `elastic compare configs/drawn_robots.yaml`",
     **{
@@ -61,6 +56,7 @@ TABLES = {
         for env in ("walker", "testbed")
     },
     "cluster": "python -m tests.cluster_trials measures it",
+    "arm_identification": "python -m tests.identification_trials measures it",
     "step": "python -m train.experiments.pages.step writes it",
     **dict.fromkeys(
         ("identification", "output_compensator", "gravity_torque"),
@@ -183,6 +179,7 @@ PARTS: Mapping[str, Part] = {
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
     "one arm": _of(arms.one_arm, "gallery"),
     "link encoders": _of(arms.link_encoders, "link_encoder"),
+    "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned posture": _of(changes_table, "learned_posture"),
@@ -190,9 +187,6 @@ PARTS: Mapping[str, Part] = {
     "learned on the testbed": _of(changes_table, "learned_testbed"),
     "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
     "learned on the walker": _of(changes_table, "learned_walker"),
-    "learned at 1.6 s": _of(changes_table, "learned_walker_1600ms"),
-    "learned on other bases": _of(changes_table, "learned_walker_bases"),
-    "ceilings of learning": _of(partial(changes_table, metrics=CEILINGS), "learned_ceilings"),
     "speed of vector environments": _of(speeds.vector_environments, "speed_walker", "speed_testbed"),
     "speed of other ways": _of(speeds.other_ways, "speed_walker", "speed_testbed"),
     "costs of cells": _of(speeds.costs_of_cells, "cluster"),
