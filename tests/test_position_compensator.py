@@ -130,6 +130,25 @@ def test_a_payload_is_a_mass_at_its_place(seed: int, mass: float) -> None:
     np.testing.assert_allclose(compensator.torque(q, q_dot, q_ddot), expected, rtol=0, atol=1e-8)
 
 
+def test_a_payload_at_a_site_is_in_the_frame_of_the_site() -> None:
+    """Catches a place in the frame of the body, a turn to the wrong side, and a site that is taken for a body."""
+    spec, at = mujoco.MjSpec.from_string(ARM), [0.1, -0.05, 0.2]
+    spec.body("finger").add_site(name="flange", pos=[0.02, 0.03, -0.1], quat=[0.8, 0.3, -0.4, 0.33166248])
+    model = spec.compile()
+    data, q = mujoco.MjData(model), np.array([0.3, -0.7, 1.1])
+    data.qpos[: len(q)] = q
+    mujoco.mj_forward(model, data)
+    finger = data.body("finger")
+    there = data.site("flange").xpos + data.site("flange").xmat.reshape(3, 3) @ at
+    in_body = finger.xmat.reshape(3, 3).T @ (there - finger.xpos)
+    torques = []
+    for body, place in (("flange", at), ("finger", in_body)):
+        compensator = PositionCompensator(model, STIFFNESS)
+        compensator.set_payload(2.0, at=place, body=body)
+        torques.append(compensator.torque(q))
+    np.testing.assert_allclose(*torques, rtol=0, atol=1e-10)
+
+
 def test_it_agrees_with_the_policies() -> None:
     """Catches another formula than Eqs. 9 and 10 of the compensators, and another order."""
     robot, q = tree(), np.array([0.3, -0.5, 0.9, 0.2, -1.1, 0.4])

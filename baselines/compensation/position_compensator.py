@@ -125,18 +125,22 @@ class PositionCompensator:
 
         Args:
             mass_kg: Mass, 0 for none [kg].
-            at: Its place in the frame of the body, (3,) [m].
-            body: Body that carries it; None for that of the last joint.
+            at: Its place in the frame of the body or site, (3,) [m].
+            body: Body or site that carries it; None for the body of the last joint.
 
         Raises:
-            ConfigurationError: No mass, no place, or no such body.
+            ConfigurationError: No mass, no place, or no such body or site.
         """
         mass = _number("mass_kg", mass_kg, "kg", least=0.0)
         place = np.array(_finite("at", at, 3, "m"))
-        bodies = {self._model.body(i).name: i for i in range(self._model.nbody)}
+        carrier = self._tip
         if body is not None:
-            require_known("body", [body], bodies)
-        carrier = self._tip if body is None else bodies[body]
+            bodies = {self._model.body(i).name: i for i in range(self._model.nbody)}
+            sites = {self._model.site(i).name: i for i in range(self._model.nsite)}
+            require_known("body or site", [body], bodies | sites)
+            carrier = bodies[body] if body in bodies else int(self._model.site_bodyid[sites[body]])
+            if body not in bodies:
+                place = _in_body(self._model, sites[body], place)
         if (carrier, *place) != (self._carrier, *self._place):
             self._load, self._carrier, self._place = 0.0, carrier, place
         self._load_wanted, self._load_step = mass, abs(mass - self._load) / self._steps
@@ -250,6 +254,13 @@ class PositionCompensator:
                 self._load_wanted if abs(way) <= self._load_step else self._load + np.copysign(self._load_step, way)
             )
             self._links.set_load(self._carrier, self._load, self._place)
+
+
+def _in_body(model: mujoco.MjModel, site: int, place: Array) -> Array:
+    """A place in the frame of a site in that of its body, (3,) [m]."""
+    turned = np.empty(3)
+    mujoco.mju_rotVecQuat(turned, place, model.site_quat[site])
+    return model.site_pos[site] + turned
 
 
 def _hinges(model: mujoco.MjModel) -> list[str]:

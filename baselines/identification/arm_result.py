@@ -130,7 +130,7 @@ def reasons(fit: ArmFit, within: float) -> list[str]:
         others = [names[j] for j in np.flatnonzero(alike[i] & ~unloaded)]
         if others:
             return f"these poses do not separate it from {', '.join(others)}"
-        return "its deflections are too small beside the noise for so few poses"
+        return f"its interval is wider than ±{100.0 * within:.3g} %: its deflections are small beside the noise"
 
     return [reason(i) for i in range(len(names))]
 

@@ -84,6 +84,7 @@ class JointShare:
     Attributes:
         joint: Its name.
         stiffness_Nm_per_rad: K of its transmission.
+        position_gain_Nm_per_rad: k_p of a servo that gives way; infinite where the servo holds its angle.
         gravity_torque_rms_Nm: Torque that it carries, rms over the poses.
         deflection_rms_rad: How far its link is from the command, rms over the poses; a servo that gives way adds to it.
         end_effector_rms_m: How far that alone moves the end effector, rms over the poses.
@@ -93,6 +94,7 @@ class JointShare:
 
     joint: str
     stiffness_Nm_per_rad: float
+    position_gain_Nm_per_rad: float
     gravity_torque_rms_Nm: float
     deflection_rms_rad: float
     end_effector_rms_m: float
@@ -284,8 +286,10 @@ def joint_shares(plant: JointPlant) -> list[JointShare]:
     shares = np.einsum("pi,pij->j", error, parts) / max(float(np.sum(error**2)), np.finfo(np.float64).tiny)
     lever = np.linalg.norm(tool.jacobian(q_ref)[0], axis=1)
     friction = lever * plant.true.coulomb_friction / plant.true.rest_stiffness("tendon")
+    with np.errstate(divide="ignore"):
+        position_gain = 1.0 / plant.true.servo_compliance
     columns = zip(
-        plant.joint_names, plant.true.stiffness, _rms(torque), _rms(q - q_ref),
+        plant.joint_names, plant.true.stiffness, position_gain, _rms(torque), _rms(q - q_ref),
         _rms(np.linalg.norm(parts, axis=1)), shares, _rms(friction), strict=True,
     )  # fmt: skip
     return [JointShare(name, *map(float, values)) for name, *values in columns]
@@ -371,11 +375,21 @@ def _shares_table(shares: Sequence[JointShare]) -> Table:
         title="where the error at rest comes from", caption=caption, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     table.add_column("joint")
-    for name in ("K\nNm/rad", "torque\nNm", "deflection\nmrad", "alone\nmm", "share\n%", "F/K\nmm"):
+    gives_way = any(np.isfinite(one.position_gain_Nm_per_rad) for one in shares)
+    for name in (
+        "K\nNm/rad",
+        *["k_p\nNm/rad"] * gives_way,
+        "torque\nNm",
+        "deflection\nmrad",
+        "alone\nmm",
+        "share\n%",
+        "F/K\nmm",
+    ):
         table.add_column(name, justify="right", vertical="bottom")
     for one in shares:
         table.add_row(
-            escape(one.joint), f"{one.stiffness_Nm_per_rad:.4g}", f"{one.gravity_torque_rms_Nm:.2f}",
+            escape(one.joint), f"{one.stiffness_Nm_per_rad:.4g}",
+            *[f"{one.position_gain_Nm_per_rad:.4g}"] * gives_way, f"{one.gravity_torque_rms_Nm:.2f}",
             f"{1e3 * one.deflection_rms_rad:.2f}", f"{1e3 * one.end_effector_rms_m:.2f}",
             f"{100.0 * one.share:.1f}", f"{1e3 * one.friction_leaves_m:.2f}",
         )  # fmt: skip

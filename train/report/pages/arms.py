@@ -23,13 +23,9 @@ def one_arm(gallery: Rows) -> str:
         [f"{1e3 * float(row[f'{kind}{policy}_rms_m']):.1f}" for policy in ("uncompensated", "input")]
         for kind in ("", "soft_")
     ]
-    lines = [
-        [f"{row['title']}, sag at rest [mm]", "without", "input"],
-        ["K as assumed", *shown[0]],
-        ["K 30 % softer", *shown[1]],
-    ]
-    text = "\n".join(f"{title:32}{without:>9}{compensated:>8}" for title, without, compensated in lines)
-    return f"```text\n{text}\n```\n"
+    head = [f"{row['title']}, sag at rest [mm]", "without compensation", "`input`"]
+    lines = [["K as assumed", *shown[0]], ["K 30 % softer than assumed", *shown[1]]]
+    return markdown_table(head, ["---", "---:", "---:"], lines) + "\n"
 
 
 def link_encoders(episodes: Rows) -> str:

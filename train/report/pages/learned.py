@@ -22,6 +22,8 @@ ARM = ("end_effector_error_rms_m", "link_error_rms_rad")
 """Metrics of an arm."""
 MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")
 """Configurations of the maps that pages show."""
+_SHORT = ("mixture", "held out")
+"""Groups of scenarios that say in short what learning adds."""
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
 _SHOWN = ("lower", "higher")
@@ -117,6 +119,24 @@ def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
     head = [*names, "", *(text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change"))]
     rules = ["---"] * (len(names) + 1) + ["---:"] * (2 * len(titles))
     return markdown_table(head, rules, lines) + "\n"
+
+
+def learning_in_short(*tables: Rows) -> str:
+    """What residuals add to their bases, in groups of scenarios, each residual on the gait that it was trained on.
+
+    Args:
+        tables: Rows of a `statistics.csv` each; the motion that comes first counts.
+    """
+    metrics, lines = _JUDGED[:2], []
+    for rows in tables:
+        own = [
+            row for row in rows if row["base_is"] == "base of the residual" and row["reference"] == rows[0]["reference"]
+        ]
+        cells = {(row["scope"], row["metric"]): row for row in own if row["pooled"] == "True"}
+        changes = [_over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT]
+        lines.append([own[0]["reference"], f"`{own[0]['base']}`", *changes])
+    head = ["step", "base", *(f"{_METRICS[metric][0]}, {scope}" for metric in metrics for scope in _SHORT)]
+    return markdown_table(head, ["---"] * 2 + ["---:"] * 4, lines) + "\n"
 
 
 def _scope(row: Mapping[str, str]) -> str:

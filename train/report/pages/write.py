@@ -14,13 +14,20 @@ from functools import partial
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
 from train.figures.step_picture import step_svg
-from train.report.leaderboard import changed, claims_markdown, leaderboard_markdown, read_leaderboard
+from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
 from train.report.pages import arms, joints, speeds, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
-from train.report.pages.learned import ARM, MAPS, LearnedMap, changes_table, learned_maps, maps_markdown
+from train.report.pages.learned import (
+    ARM,
+    MAPS,
+    LearnedMap,
+    changes_table,
+    learned_maps,
+    learning_in_short,
+    maps_markdown,
+)
 from train.runs.escaping import markdown_table
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -28,7 +35,6 @@ PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = ("uncompensated_rms", "uncompensated_peak", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
-_SHORT = ("mixture", "held out")
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
@@ -106,25 +112,6 @@ def walks_beside_the_paper(walks: Rows) -> str:
     return markdown_table(head, ["---"] * 2 + ["---:"] * 3, rows) + "\n"
 
 
-def learning_in_short(standings: Sequence[Standing]) -> str:
-    """What learning adds in the motion that comes first: over its base, and over the best policy without learning."""
-    first = standings[0].reference
-    found = [s for s in standings if s.training_seeds and s.reference == first and s.scope in _SHORT]
-    titles = list(dict.fromkeys(s.title for s in found))
-    rows = [
-        [f"{policy}, {scope}", *(shown for title in titles for shown in _over(own, title))]
-        for (policy, scope), own in grouped(found, lambda s: (s.policy, s.scope)).items()
-    ]
-    head = [f"step period {first}", *(f"{title}, ({over})" for title in titles for over in "ab")]
-    return markdown_table(head, ["---", *["---:"] * 2 * len(titles)], rows) + "\n"
-
-
-def _over(standings: Sequence[Standing], title: str) -> tuple[str, str]:
-    """The change in a metric over the base, and over the best policy without learning, which may be the base."""
-    own = next(s for s in standings if s.title == title)
-    return changed(own.base), "as (a)" if own.rival is None else changed(own.rival)
-
-
 def gallery_table(gallery: Rows) -> str:
     """How far the robots of the gallery sag, with and without compensation."""
     rows = []
@@ -173,7 +160,7 @@ def _of_map(name: str) -> Part:
 PARTS: Mapping[str, Part] = {
     "leaderboard": _of_standings(leaderboard_markdown),
     "what learning adds": _of_standings(claims_markdown),
-    "learning in short": _of_standings(learning_in_short),
+    "learning in short": _of(learning_in_short, "learned_walker", "learned_posture", "learned_posture_1600ms"),
     "published controllers": _of_standings(walks.published_controllers),
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
