@@ -587,6 +587,8 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
     with pytest.raises(ConfigurationError, match=r"no residual at .*residual\.json"):
         baselines.make(f"residual:{tmp_path}", env)
     path = folder(tmp_path / "r")
+    with pytest.raises(ConfigurationError, match=rf"is no residual but has some inside; give one of them: {path}$"):
+        baselines.make(f"residual:{tmp_path}", env)
     silent = json.dumps({"robot": "testbed"})
     for text, message in (("{", "is not JSON"), ("[]", "must be a mapping, got list"), (silent, "base")):
         (path / "residual.json").write_text(text)

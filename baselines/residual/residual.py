@@ -5,6 +5,7 @@ no code from it and needs no torch. The observation is normalised in here; the b
 """
 
 from hashlib import sha256
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -196,11 +197,24 @@ def read_description(folder: Path) -> ResidualDescription:
         ConfigurationError: There is none, or it is not valid.
     """
     folder = located(folder)
-    return load_json(
-        folder / DESCRIPTION, ResidualDescription, "residual",
-        lambda why: f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({why}), or the "
-        f"name of one that comes with the package: {', '.join(shipped())}",
-    )  # fmt: skip
+    return load_json(folder / DESCRIPTION, ResidualDescription, "residual", lambda why: _none_at(folder, why))
+
+
+def _none_at(folder: Path, why: str) -> str:
+    """What to do where no residual is, in a sentence."""
+    inside = sorted(path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}"))
+    if inside:
+        return f"{folder} is no residual but has some inside; give one of them: {', '.join(map(str, inside))}"
+    families = {name: [at.partition("/")[2] for at in own] for name, own in groupby(shipped(), _family)}
+    names = ", ".join(f"{name}/{own[0]} to {own[-1]}" for name, own in families.items())
+    return (
+        f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({why}), or the name of one "
+        f"that comes with the package: {names}"
+    )
+
+
+def _family(name: str) -> str:
+    return name.partition("/")[0]
 
 
 def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
