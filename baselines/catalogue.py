@@ -27,6 +27,7 @@ from baselines.walking.foot_balance import FootBalance
 from baselines.walking.hip_torque import HipTorque
 from baselines.walking.posture import PostureFeedback
 from baselines.walking.stance_roll import StanceRoll
+from baselines.walking.zmp_offset import ZmpOffset
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
@@ -123,6 +124,16 @@ def _with_posture(build: Builder) -> Builder:
     )
 
 
+def _with_offset(build: Builder) -> Builder:
+    """With the planned ZMP shifted against its mean error, where that is asked for."""
+
+    def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        policy = build(env, model, options)
+        return policy if options.zmp_offset is None else ZmpOffset(policy, model, options.zmp_offset)
+
+    return built
+
+
 def learned_base(options: PolicyOptions, is_walker: bool) -> str:
     """Name of the policy whose offsets `iterative` learns."""
     name = options.learned_base or ("adaptive_posture" if is_walker else "input")
@@ -190,6 +201,7 @@ _COMPENSATOR = (*ASSUMED_OPTIONS, "output", "gravity", "ramp_s")
 _CONTROLLER = ("gains", "com_feedback")
 _COMPENSATED = (*_COMPENSATOR, *_CONTROLLER)
 _MEASURED = (*_COMPENSATED, "adaptation")
+_POSTURE = ("posture", "zmp_offset")
 _LEARNED = ("learned_base", "learning")
 
 ON_JOINTS: Mapping[str, NamedPolicy] = {
@@ -214,9 +226,9 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
     "adaptive": NamedPolicy(_weighing(_adaptive), (*_COMPENSATED, "base", "adaptation")),
-    "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", "posture")),
+    "posture": NamedPolicy(_with_offset(_with_posture(_base)), (*_COMPENSATED, "base", *_POSTURE)),
     "adaptive_posture": NamedPolicy(
-        _weighing(_with_posture(_adaptive)), (*_COMPENSATED, "base", "adaptation", "posture")
+        _with_offset(_weighing(_with_posture(_adaptive))), (*_COMPENSATED, "base", "adaptation", *_POSTURE)
     ),
     "torque_sensor": NamedPolicy(
         _weighing(_measured(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)

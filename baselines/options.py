@@ -12,6 +12,7 @@ from baselines.walking.foot_balance import FootBalanceGains
 from baselines.walking.hip_torque import HipTorqueGains
 from baselines.walking.posture import PostureGains
 from baselines.walking.stance_roll import StanceRollGains
+from baselines.walking.zmp_offset import ZmpOffsetGains
 from elastic_env.core.config import Model, quantity
 from elastic_env.motion.trajectory import STAND_S
 
@@ -39,6 +40,8 @@ class PolicyOptions(Model):
     """How fast the stiffness is adapted."""
     posture: PostureGains = PostureGains()
     """Walker: gains of the posture feedback."""
+    zmp_offset: ZmpOffsetGains | None = None
+    """Walker: how the planned ZMP is shifted against the mean error of the measured one; None for not at all."""
     stance_roll: StanceRollGains = StanceRollGains()
     """Walker: hip roll feedforward of `thormang`."""
     foot_balance: FootBalanceGains = FootBalanceGains()

@@ -22,7 +22,6 @@ from baselines.walking.zmp_shift import zmp_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.ground_contact import zero_moment_point
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 LINK_IMU = "link_angle_imu"
@@ -90,10 +89,8 @@ class WalkSignals:
 
     def measured_zmp(self, seen: Array) -> Array:
         """ZMP by the foot sensors, (num_worlds, 2) [m]; nan where the feet carry almost nothing."""
-        biped, n = self._model.biped, len(seen)
-        flat = np.broadcast_to(np.eye(3), (n, 2, 3, 3))
-        force, moment = biped.foot_sensors.ground_wrench(seen[:, self._wrench].reshape(n, 2, 2, 3), flat)
-        return zero_moment_point(force, moment, biped.ankles, _LEAST_LOAD * biped.weight)
+        biped = self._model.biped
+        return biped.zmp_on_footholds(seen[:, self._wrench], _LEAST_LOAD * biped.weight)
 
     def offsets(self, table: Array) -> Array:
         """See `LearnedSignals`."""

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.ground_contact import FootSensors
+from elastic_env.dynamics.ground_contact import FootSensors, zero_moment_point
 from elastic_env.dynamics.leg_chains import LegChains
 from elastic_env.dynamics.leg_kinematics import JOINTS, LegGeometry, leg_angles
 
@@ -77,6 +77,18 @@ class Biped:
     def ankles(self) -> Array:
         """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
         return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
+
+    def zmp_on_footholds(self, wrench: Array, least_n: float) -> Array:
+        """ZMP by the sensors at the ankles, as if the feet lay flat on their footholds, (n, 2) [m].
+
+        Args:
+            wrench: Force and moment at each ankle in the frame of the foot, (n, 12) or (n, 2, 2, 3) [N], [N·m].
+            least_n: Vertical force below which there is no ZMP, and the result is nan [N].
+        """
+        n = len(wrench)
+        flat = np.broadcast_to(np.eye(3), (n, 2, 3, 3))
+        force, moment = self.foot_sensors.ground_wrench(wrench.reshape(n, 2, 2, 3), flat)
+        return zero_moment_point(force, moment, self.ankles, least_n)
 
     def joint_angles(self, pelvis: Array, ankles: Array) -> Array:
         """Inverse kinematics with level pelvis and soles.

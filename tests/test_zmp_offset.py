@@ -1,0 +1,101 @@
+"""The planned ZMP that is shifted against its mean error."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import baselines
+import elastic_env  # noqa: F401  registers the environments
+from baselines.compensation.inputs import PolicyInputs
+from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+
+OFFSET_M = np.array([0.011, -0.004])
+STEPS = 500
+
+
+def vector(scenario: str = "nominal") -> Any:
+    """Two worlds of the walker at 3 s."""
+    return gymnasium.make_vec(
+        "elastic_env/WalkInPlace-v0", num_envs=2, vectorization_mode="vector_entry_point", scenario=scenario,
+        num_threads=1,
+    )  # fmt: skip
+
+
+class Recorder:
+    """A policy that notes how far it is asked to shift the ZMP."""
+
+    inputs = ("zmp",)
+
+    def __init__(self) -> None:
+        self.shifts: list[Array] = []
+
+    def predict_with(self, observation: Array, inputs: PolicyInputs, *_: Any) -> tuple[Array, None]:
+        assert inputs.zmp is not None
+        self.shifts.append(inputs.zmp.copy())
+        return np.zeros((len(observation), 12), dtype=np.float32), None
+
+
+def standing(env: Any) -> Array:
+    """Observations of two worlds that stand; the ground's forces act off the planned ZMP, in the second one not."""
+    observation, _ = env.reset(seed=0)
+    rows = np.array(observation, dtype=np.float64)
+    table, biped = env.unwrapped.task.observation_table, env.unwrapped.task.assumed_model.biped
+    half, (x, y) = biped.weight / 2.0, OFFSET_M
+    feet = biped.foot_sensors
+    wrench = np.zeros((2, 2, 2, 3))
+    for foot in range(2):
+        mass_n = -feet.weight[foot, 2]
+        wrench[:, foot, 0, 2] = half - mass_n  # what the ankle carries
+        # the ground pushes up at (x, y) from the ankle, and the foot's own weight pulls down at its center
+        wrench[0, foot, 1] = [y * half, -x * half, 0.0]
+        wrench[:, foot, 1, :2] += np.array([-feet.com[foot, 1], feet.com[foot, 0]]) * mass_n
+    rows[:, table.group("wrench")] = wrench.reshape(2, -1)
+    rows[:, table.group("zmp_reference")] = biped.ankles[:, :2].mean(axis=0)
+    return rows
+
+
+def test_a_constant_error_is_integrated_up_to_the_limit() -> None:
+    """Catches a wrong sign, a foot that weighs nothing, a rate per step in place of per second, and no limit."""
+    env = vector()
+    model, recorder = env.unwrapped.task.assumed_model, Recorder()
+    policy = ZmpOffset(recorder, model, ZmpOffsetGains(time_constant_s=2.0, limit_m=0.008))
+    rows, state = standing(env), None
+    for step in range(STEPS):
+        _, state = policy.predict_with(rows, PolicyInputs(), state, np.full(2, step == 0))
+    time_s = np.arange(1, STEPS + 1) * model.control_period_s
+    expected = np.clip(-OFFSET_M * time_s[:, None] / 2.0, -0.008, 0.008)
+    assert abs(expected[-1, 0]) == 0.008 > abs(expected[-1, 1])
+    shifts = np.array(recorder.shifts)
+    np.testing.assert_allclose(shifts[:, 0], expected, atol=1e-12)
+    np.testing.assert_allclose(shifts[:, 1], 0.0, atol=1e-12)
+    policy.predict_with(rows, PolicyInputs(zmp=np.full((2, 2), 0.01)), state, np.array([True, False]))
+    np.testing.assert_allclose(recorder.shifts[-1][0], 0.01 - OFFSET_M * time_s[0] / 2.0, atol=1e-12)
+    np.testing.assert_allclose(recorder.shifts[-1][1], 0.01, atol=1e-12)
+
+
+def test_on_a_slope_the_mean_error_of_the_zmp_goes() -> None:
+    """Catches an integral that the body does not follow, and one that is never built in."""
+    left = {}
+    for offset in (None, {"time_constant_s": 1.5}):
+        env = vector("slope")
+        policy = baselines.make("adaptive_posture", env, zmp_offset=offset)
+        observation, _ = env.reset(seed=3)
+        state, start, deviations = None, np.ones(2, dtype=np.bool_), []
+        for _ in range(1500):
+            action, state = policy.predict(observation, state, start)
+            observation, *_, info = env.step(action)
+            start = np.zeros(2, dtype=np.bool_)
+            deviations.append([info["zmp_deviation_x"], info["zmp_deviation_y"]])
+        left[offset is None] = np.linalg.norm(np.nanmean(deviations[750:], axis=0), axis=0)
+    assert (left[True] > 5e-3).all()
+    assert (left[False] < 0.5 * left[True]).all()
+
+
+def test_policies_without_posture_feedback_have_none() -> None:
+    """Catches an option that is taken and has no effect."""
+    with pytest.raises(ConfigurationError, match="zmp_offset"):
+        baselines.make("input_output", vector(), zmp_offset={})
