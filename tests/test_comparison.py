@@ -197,6 +197,12 @@ def test_the_best_policy_without_learning_is_the_one_that_the_user_names() -> No
     assert (added.title, added.options) == (f"{BEST_ON_THE_WALKER} (best analytic)", {})
     describe(Path("two"), 1, base=BEST_ON_THE_WALKER)
     assert [e.member.rival for e in expand([PolicySpec(name="residual:two")]) if e.member] == [None]
+    plain = PolicySpec(name=str(BEST_ON_THE_WALKER))
+    assert [e.member.rival for e in expand([plain, tuned, PolicySpec(name="residual:two")]) if e.member] == [None]
+    describe(Path("three"), 1, base=BEST_ON_THE_WALKER, base_options=tuned.options)
+    for listed, rival in (([tuned], None), ([tuned, plain], BEST_ON_THE_WALKER)):
+        members = [e.member for e in expand([*listed, PolicySpec(name="residual:three")]) if e.member]
+        assert [(member.base, member.rival) for member in members] == [("tuned", rival)]
 
 
 def test_shipped_policies_are_a_family_wherever_one_works() -> None:

@@ -224,19 +224,22 @@ def _beside(residual: PolicySpec, taken: Sequence[PolicySpec], name: str, role: 
 def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
     """The best policy without learning, with the same sensors, in the same environment; None where that is the base.
 
-    One that is among the policies counts if it assumes the same stiffness, whatever its other options.
+    One that is among the policies counts if it assumes the same stiffness, whatever its other options. Where the base
+    is that policy with options, it is compared with the plain one if that is among the policies.
     """
     known = ENVIRONMENTS.get(description.robot)
     name = best_analytic(known is not None and known.walks)
-    if name is None or name == description.base:
+    if name is None:
         return None
-    assumed = {o: v for o, v in _base_options(description, residual).items() if o in ASSUMED_OPTIONS}
+    options, is_base = _base_options(description, residual), name == description.base
+    assumed = {option: value for option, value in options.items() if option in ASSUMED_OPTIONS}
     for policy in taken:
-        mine = {option: value for option, value in _given(policy.options).items() if option in ASSUMED_OPTIONS}
+        given = _given(policy.options)
+        mine = given if is_base else {option: v for option, v in given.items() if option in ASSUMED_OPTIONS}
         same = policy.env_options == residual.env_options and policy.level == residual.level
         if policy.name == name and mine == assumed and same:
-            return policy
-    return _beside(residual, taken, name, "best analytic", assumed)
+            return policy if not is_base or options != assumed else None
+    return None if is_base else _beside(residual, taken, name, "best analytic", assumed)
 
 
 def _base_options(description: ResidualDescription, residual: PolicySpec) -> dict[str, object]:

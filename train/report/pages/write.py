@@ -46,6 +46,7 @@ TABLES = {
         for name in (
             "learned_posture",
             "learned_posture_1600ms",
+            "learned_posture_1100ms",
             "learned_robot",
             "learned_testbed",
             "learned_walker",
@@ -160,7 +161,9 @@ def _of_map(name: str) -> Part:
 PARTS: Mapping[str, Part] = {
     "leaderboard": _of_standings(leaderboard_markdown),
     "what learning adds": _of_standings(claims_markdown),
-    "learning in short": _of(learning_in_short, "learned_walker", "learned_posture", "learned_posture_1600ms"),
+    "learning in short": _of(
+        learning_in_short, "learned_walker", "learned_posture", "learned_posture_1600ms", "learned_posture_1100ms"
+    ),
     "published controllers": _of_standings(walks.published_controllers),
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
     "walks beside the paper": _of(walks_beside_the_paper, "demo_episodes"),
@@ -171,6 +174,7 @@ PARTS: Mapping[str, Part] = {
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned posture": _of(changes_table, "learned_posture"),
     "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
+    "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
     "learned on the testbed": _of(changes_table, "learned_testbed"),
     "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
     "learned on the walker": _of(changes_table, "learned_walker"),
