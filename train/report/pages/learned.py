@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import FEWEST_SEEDS, percent, percent_interval
+from train.evaluate.changes import BEST_ANALYTIC, FEWEST_SEEDS, percent, percent_interval
 from train.evaluate.evaluate import grouped
 from train.evaluate.statistics import Estimate
 from train.report.pages.cells import Rows
@@ -24,6 +24,9 @@ MAPS = ("map_stiffness_imu", "map_stiffness_period", "map_payload_slope")
 """Configurations of the maps that pages show."""
 _SHORT = ("mixture", "held out")
 """Groups of scenarios that say in short what learning adds."""
+GROUPS = ("mixture", "held out", "joined", "slope", "imu", "drawn")
+"""Groups of scenarios, and scenarios that stand for themselves."""
+_BASE = "base of the residual"
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
 _SHOWN = ("lower", "higher")
@@ -101,14 +104,19 @@ def maps_markdown(maps: Iterable[LearnedMap]) -> str:
     return "\n".join(f"{each.sentence}\n\n{each.table}\n" for each in maps)
 
 
-def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
+def changes_table(
+    rows: Rows, metrics: Sequence[str] = _JUDGED, scopes: Sequence[str] = (), against: str = _BASE
+) -> str:
     """Paired changes of residuals over their bases in every scenario and group, from the rows of a `statistics.csv`.
 
     Args:
         rows: Its rows.
         metrics: The metrics that are shown, where the table has them.
+        scopes: The scenarios and groups that are shown; empty for all.
+        against: What the residuals are compared with, as the rows say it.
     """
-    own = [row for row in rows if row["base_is"] == "base of the residual" and row["metric"] in metrics]
+    own = [row for row in rows if row["base_is"] == against and row["metric"] in metrics]
+    own = [row for row in own if row["kind"] == "residual" and (row["scope"] in scopes or not scopes)]
     titles = {metric: _METRICS[metric] for metric in metrics if any(row["metric"] == metric for row in own)}
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
     lines = []
@@ -121,6 +129,15 @@ def changes_table(rows: Rows, metrics: Sequence[str] = _JUDGED) -> str:
     return markdown_table(head, rules, lines) + "\n"
 
 
+def beyond_the_best(*tables: Rows) -> str:
+    """Changes of residuals over the best policy without learning, in groups of scenarios.
+
+    Args:
+        tables: Rows of a `statistics.csv` each.
+    """
+    return changes_table([row for rows in tables for row in rows], scopes=GROUPS, against=BEST_ANALYTIC)
+
+
 def learning_in_short(*tables: Rows) -> str:
     """What residuals add to their bases, in groups of scenarios, each residual on the gait that it was trained on.
 
@@ -129,9 +146,7 @@ def learning_in_short(*tables: Rows) -> str:
     """
     metrics, lines = _JUDGED[:2], []
     for rows in tables:
-        own = [
-            row for row in rows if row["base_is"] == "base of the residual" and row["reference"] == rows[0]["reference"]
-        ]
+        own = [row for row in rows if row["base_is"] == _BASE and row["reference"] == rows[0]["reference"]]
         cells = {(row["scope"], row["metric"]): row for row in own if row["pooled"] == "True"}
         changes = [_over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT]
         lines.append([own[0]["reference"], f"`{own[0]['base']}`", *changes])

@@ -23,6 +23,7 @@ from train.report.pages.learned import (
     ARM,
     MAPS,
     LearnedMap,
+    beyond_the_best,
     changes_table,
     learned_maps,
     learning_in_short,
@@ -44,6 +45,8 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
+            "learned_offset",
+            "learned_offset_played",
             "learned_posture",
             "learned_posture_1600ms",
             "learned_posture_1100ms",
@@ -172,6 +175,8 @@ PARTS: Mapping[str, Part] = {
     "identification of an arm": _of(arms.arm_identification, "arm_identification"),
     "gallery": _of(gallery_table, "gallery"),
     "gallery pictures": _of(gallery_pictures, "gallery"),
+    "learned with an offset": _of(changes_table, "learned_offset"),
+    "learned beyond the best": _of(beyond_the_best, "learned_offset", "learned_offset_played"),
     "learned posture": _of(changes_table, "learned_posture"),
     "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
     "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
