@@ -28,6 +28,7 @@ RESIDUALS = {
     "walker_3s": "learned_walker",
     "walker_3s_posture": "learned_posture",
     "walker_3s_offset": "learned_offset",
+    "walker_3s_constants": "learned_constants",
     "walker_1600ms_posture": "learned_posture_1600ms",
     "walker_1100ms_posture": "learned_posture_1100ms",
 }

@@ -21,6 +21,7 @@ from train.report.pages import arms, joints, speeds, walks
 from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
 from train.report.pages.learned import (
     ARM,
+    GROUPS,
     MAPS,
     LearnedMap,
     beyond_the_best,
@@ -45,6 +46,7 @@ TABLES = {
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
+            "learned_constants",
             "learned_offset",
             "learned_offset_played",
             "learned_posture",
@@ -177,6 +179,7 @@ PARTS: Mapping[str, Part] = {
     "gallery pictures": _of(gallery_pictures, "gallery"),
     "learned with an offset": _of(changes_table, "learned_offset"),
     "learned beyond the best": _of(beyond_the_best, "learned_offset", "learned_offset_played"),
+    "constants": _of(partial(changes_table, scopes=GROUPS), "learned_constants"),
     "learned posture": _of(changes_table, "learned_posture"),
     "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
     "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
