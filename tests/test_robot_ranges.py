@@ -1,6 +1,5 @@
 """Robots drawn from ranges: the draws themselves, what of them reaches plant and sensors, and who may know of it."""
 
-import copy
 import math
 from pathlib import Path
 from typing import Any
@@ -23,12 +22,17 @@ from elastic_env.robots.thormang.config import floor_tilt, robot_bank
 from elastic_env.robots.thormang.environment import configure_walk
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
-from elastic_env.robots.thormang.model import add_load, elastic_spec
+from elastic_env.robots.thormang.model import DRAWN_LOAD, add_load, elastic_spec
 from elastic_env.runtime.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
 from elastic_env.runtime.sensors import InertialSensor
 
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
 MASS_KG = 57.0
+DRAWN_FIELDS = (
+    "tendon_stiffness", "tendon_damping", "tendon_lengthspring", "dof_frictionloss", "body_quat", "body_pos",
+    "body_mass", "body_inertia",
+    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0",  # by the masses
+)  # fmt: skip
 NAMES = [name for name, _ in RobotRanges().intervals()]
 
 
@@ -43,12 +47,8 @@ def robot_of(env: Any, world: int = 0) -> RobotDraw:
 
 
 def plant_of(env: Any, world: int) -> mujoco.MjModel:
-    """The model that a world steps: that of all, with the world's own fields."""
-    simulation = env.unwrapped.simulation
-    model = copy.copy(env.unwrapped.task.model)
-    for name in walk_config.drawn_fields(env.unwrapped.task.config.scenario):
-        getattr(model, name)[:] = simulation.vary(name)[world]
-    return model
+    """The model that a world steps."""
+    return env.unwrapped.simulation.model_of(world)
 
 
 def is_within(ranges: RobotRanges, robot: RobotDraw) -> bool:
@@ -232,7 +232,7 @@ def test_a_drawn_robot_accelerates_as_one_that_is_compiled_with_its_values(world
         for (name, joint), factor in zip(config.true_joints.items(), robot.stiffness_factor, strict=True)
     }
     spec = elastic_spec(config.robot, joints, "tendon", config.timestep_s)
-    add_load(spec, robot.load_kg, np.array(robot.load_place_m))
+    add_load(spec, DRAWN_LOAD, robot.load_kg, np.array(robot.load_place_m))
     spec.body("floor").quat = floor_tilt(robot.slope_rad, robot.slope_direction_rad)
     compiled = spec.compile()
     generator, seen = np.random.default_rng(0), []
@@ -277,7 +277,7 @@ def test_the_load_moves_the_center_of_mass_by_its_share_of_the_weight() -> None:
     env.reset(seed=0)
     robot, simulation = robot_of(env), env.simulation
     body = {name: simulation.model.body(name).id for name in ("pelvis", "upper_body", "drawn_load")}
-    centers, masses = np.array(simulation.bind("xipos")[0]), np.array(simulation.vary("body_mass")[0])
+    centers, masses = np.array(simulation.bind("xipos")[0]), simulation.model.body_mass.copy()
     R = np.array(simulation.bind("ximat")[0, body["upper_body"]]).reshape(3, 3)  # of the principal axes
     frame = np.array(simulation.bind("xmat")[0, body["upper_body"]]).reshape(3, 3)
     assert np.linalg.det(R) == pytest.approx(1.0)
@@ -324,12 +324,11 @@ def test_fields_follow_the_robot_from_episode_to_episode() -> None:
     second = [plant_of(env, world) for world in (0, 1)]
     env.reset(seed=[4, 5])
     third = [plant_of(env, world) for world in (0, 1)]
-    for name in walk_config.drawn_fields(make_scenario("drawn")):
+    for name in DRAWN_FIELDS:
         values = [[getattr(model, name) for model in models] for models in (first, second, third)]
         np.testing.assert_array_equal(values[1][1], values[0][1], err_msg=name)
         np.testing.assert_array_equal(values[2][0], values[0][0], err_msg=name)
-        if name != "dof_damping":  # without viscous friction
-            assert not np.array_equal(values[1][0], values[0][0]), name
+        assert not np.array_equal(values[1][0], values[0][0]), name
 
 
 def test_signals_know_the_drawn_joints() -> None:
@@ -364,7 +363,7 @@ def test_floor_and_pushes_are_those_of_the_robot() -> None:
         largest = np.maximum(largest, np.linalg.norm(force[:, :3], axis=1))
     robots = [robot_of(env, world) for world in range(3)]
     np.testing.assert_allclose(largest, [robot.push_n for robot in robots], rtol=1e-12)
-    quaternions = env.unwrapped.simulation.vary("body_quat")[:, floor]
+    quaternions = np.array([plant_of(env, world).body_quat[floor] for world in range(3)])
     np.testing.assert_allclose(2.0 * np.arccos(quaternions[:, 0]), [r.slope_rad for r in robots], rtol=1e-6)
     assert len({robot.push_n for robot in robots}) == 3
 

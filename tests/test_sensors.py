@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.runtime.sensors import AttitudeSensor, NoiseStream, attitude, is_due, quantise
+from elastic_env.runtime.sensors import AttitudeSensor, NoiseStream, angle_of_count, attitude, is_due, quantise
 
 COUNTS = 501_923
 ONE, TWO = np.dtype([("a", np.float64)]), np.dtype([("a", np.float64), ("b", np.float64)])
@@ -19,16 +19,16 @@ ONE, TWO = np.dtype([("a", np.float64)]), np.dtype([("a", np.float64), ("b", np.
 def test_quantised_angles_are_the_nearest_whole_counts(angle: float, counts: int) -> None:
     """Catches truncation in place of rounding, and degrees or radians per count mixed up."""
     step = 2.0 * np.pi / counts
-    shown = quantise(np.array([angle]), counts)[0]
+    shown = quantise(np.array([angle]), angle_of_count(counts))[0]
     assert abs(shown - angle) <= step / 2 * (1 + 1e-9)
     assert shown / step == pytest.approx(round(shown / step), abs=1e-6)
-    assert quantise(np.array([shown]), counts)[0] == shown
+    assert quantise(np.array([shown]), angle_of_count(counts))[0] == shown
 
 
 def test_an_encoder_without_counts_is_continuous() -> None:
     """Catches a default resolution where none was asked for; and the input array must not be handed on for writing."""
     angle = np.array([0.1, 0.2])
-    np.testing.assert_array_equal(quantise(angle, None), angle)
+    np.testing.assert_array_equal(quantise(angle, angle_of_count(None)), angle)
 
 
 def test_attitude_adds_up_its_errors() -> None:

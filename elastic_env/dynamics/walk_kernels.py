@@ -243,7 +243,8 @@ def measure(inertial: Any, row: Any, noise: Any, bias: Any, quality: Any, imu_is
     """What encoders, IMU and foot sensors show; an IMU that is not due shows its last sample."""
     for i in range(len(shown.encoder)):
         shown.encoder_before[i] = shown.encoder[i]
-        shown.encoder[i] = in_whole_counts(row.theta[i] + bias.encoder[i], quality.count_rad)
+        angle = row.theta[i] + bias.encoder[i]
+        shown.encoder[i] = in_whole_counts(angle, quality.count_rad) if quality.count_rad > 0.0 else angle
     for foot in range(2):
         for i in range(3):
             force, moment = row.wrench[foot, 0, i], row.wrench[foot, 1, i]
@@ -398,9 +399,9 @@ def cross(x: float, y: float, z: float, other: Array) -> tuple[float, float, flo
 
 
 @within_compiled
-def in_whole_counts(angle: Any, count_rad: float) -> Any:
-    """The nearest whole counts of an encoder, as an angle [rad]; counts of 0 leave it as it is."""
-    return np.rint(angle / count_rad) * count_rad if count_rad > 0.0 else angle
+def in_whole_counts(angle: Any, count_rad: Any) -> Any:
+    """The nearest whole counts of an encoder, as an angle [rad]."""
+    return np.rint(angle / count_rad) * count_rad
 
 
 @within_compiled

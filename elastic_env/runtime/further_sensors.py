@@ -25,7 +25,7 @@ from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
 from elastic_env.core.state import Stateful
 from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import NoiseStream, quantise
+from elastic_env.runtime.sensors import NoiseStream, angle_of_count, quantise
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,8 @@ class FurtherSensors(Stateful):
     Args:
         names: Of `SENSORS`.
         joints: The robot's joints in order, and what their angles are in the mirror, None where it has none.
-        scenario: Whose `sensor_noise` scales noise and offset, and which has the encoders' errors.
+        scenarios: Of every world: its `sensor_noise` scales noise and offset, and it has the encoders' errors.
         counts_per_turn: Of the encoders.
-        num_worlds: How many.
 
     Raises:
         ConfigurationError: There is no such sensor.
@@ -118,14 +117,16 @@ class FurtherSensors(Stateful):
         self,
         names: Sequence[str],
         joints: Mapping[str, Mirrored | None],
-        scenario: Scenario,
+        scenarios: Sequence[Scenario],
         counts_per_turn: int | None,
-        num_worlds: int,
     ) -> None:
         require_known("sensor", names, SENSORS)
         self._sensors = {name: SENSORS[name] for name in names}
-        self._scenario = scenario
-        self._counts = counts_per_turn if scenario.encoder_counts else None
+        num_worlds = len(scenarios)
+        self._homing_rad = [scenario.homing_width_rad for scenario in scenarios]
+        self._scale = np.array([[scenario.sensor_noise] for scenario in scenarios])
+        counts = [counts_per_turn if scenario.encoder_counts else None for scenario in scenarios]
+        self._count_rad = np.array([[angle_of_count(own)] for own in counts])
         groups = [sensor.group(name, joints) for name, sensor in self._sensors.items()]
         self.signals = SignalTable.of(groups).signals
         """Their columns of the observation, in order."""
@@ -145,7 +146,7 @@ class FurtherSensors(Stateful):
         for world in np.flatnonzero(worlds).tolist():
             for name, sensor in self._sensors.items():
                 offset = self._offset[name]
-                width = self._scenario.homing_width_rad if sensor.is_encoder else self._scale * sensor.offset
+                width = self._homing_rad[world] if sensor.is_encoder else self._scale[world] * sensor.offset
                 offset[world] = width * draws[world].robot.uniform(-1.0, 1.0, offset.shape[1])
             self._noise.restart(world, draws[world].noise())
         self.measure(worlds, truth)
@@ -166,11 +167,7 @@ class FurtherSensors(Stateful):
         """What they show, (num_worlds, columns); in worlds whose measurements are old, a control step ago."""
         return np.where(is_delayed[:, None], self._before, self._now)
 
-    @property
-    def _scale(self) -> float:
-        return self._scenario.sensor_noise
-
     def _shown(self, sensor: Sensor, value: Array, drawn: Array) -> Array:
         if sensor.is_encoder:
-            return quantise(value, self._counts)
+            return quantise(value, self._count_rad)
         return value + self._scale * sensor.noise * drawn

@@ -30,7 +30,7 @@ from elastic_env.runtime.metrics import Metric
 from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
 from elastic_env.runtime.robot_model import RobotModel
 from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import NoiseStream, PendulumImu, attitude, is_due, quantise
+from elastic_env.runtime.sensors import NoiseStream, PendulumImu, angle_of_count, attitude, is_due, quantise
 from elastic_env.runtime.task import Outcome
 
 ACTION_BOUND_RAD = 0.3
@@ -251,7 +251,7 @@ class JointTask(Stateful):
         )
         others = [sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR]
         self._sensors = FurtherSensors(
-            others, dict.fromkeys(joints), config.scenario, plant.true.encoder_counts_per_turn, num_worlds
+            others, dict.fromkeys(joints), [config.scenario] * num_worlds, plant.true.encoder_counts_per_turn
         )
         self.action_table = action_table(joints)
         observed = [*observation_signals(joints), *([LINK_IMU] if observe_imu else []), *self._sensors.signals]
@@ -280,6 +280,9 @@ class JointTask(Stateful):
     def num_steps(self) -> int:
         """Control steps of an episode."""
         return self._reference.num_steps
+
+    def furnish(self, simulation: Simulation) -> None:
+        """See `elastic_env.runtime.task.Task`; all that differs is varied, which the physics keeps."""
 
     def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
         """Place the robot at rest under zero offset: the servos hold q_ref, the springs are already deflected."""
@@ -478,7 +481,7 @@ class JointTask(Stateful):
         counts = self._true_model.encoder_counts_per_turn if scenario.encoder_counts else None
         due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
         fresh = Measurement(
-            encoder=quantise(self._state.theta + self._encoder_bias, counts),
+            encoder=quantise(self._state.theta + self._encoder_bias, angle_of_count(counts)),
             encoder_before=last.encoder,
             imu=np.where(due[:, None], self._link_angle(due), last.imu),
         )

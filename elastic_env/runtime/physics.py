@@ -43,6 +43,13 @@ class Simulation(Protocol):
         """A live (num_worlds, ...) array of a field of `MjModel`, of each world its own from now on."""
         ...
 
+    def take(self, world: int, model: mujoco.MjModel) -> None:
+        """Give a world a model of its own, with as many bodies, joints and sensors, instead of varied fields.
+
+        The state of the world stays. `get_state` does not hold the models: give them again after `set_state`.
+        """
+        ...
+
     def advance(self, num_substeps: int) -> None:
         """Step every world by `num_substeps` physics steps under its current `ctrl`."""
         ...
@@ -145,6 +152,14 @@ class SingleWorld:
         self._varied.add(field)
         return getattr(self.model, field)[None]
 
+    def take(self, world: int, model: mujoco.MjModel) -> None:  # noqa: ARG002  there is one
+        """See `Simulation`."""
+        self.model = model
+
+    def model_of(self, world: int) -> mujoco.MjModel:  # noqa: ARG002  there is one
+        """The model of a world with all that is its own, for reading."""
+        return self.model
+
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""
         mujoco.mj_step(self.model, self._data, num_substeps)
@@ -174,9 +189,17 @@ class ManyWorlds:
         threads = min(num_threads or os.cpu_count() or 1, num_worlds)
         self._start(model, num_worlds, threads, _Warnings())
 
-    def _start(self, model: mujoco.MjModel, num_worlds: int, num_threads: int, said: _Warnings) -> None:
+    def _start(
+        self,
+        model: mujoco.MjModel,
+        num_worlds: int,
+        num_threads: int,
+        said: _Warnings,
+        own: list[mujoco.MjModel] | None = None,
+    ) -> None:
         """Begin with worlds in the model's default state, and threads of this process."""
         self.model, self.num_worlds, self._warnings, self._process = model, num_worlds, said, os.getpid()
+        self._own_models, self._are_given = own, own is None
         self._varied: set[str] = set()
         self._bound: set[str] = set()
         self._views: dict[tuple[str, ...], tuple[Array, ...]] = {}
@@ -186,20 +209,23 @@ class ManyWorlds:
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a process that was forked."""
-        made = (self.model, self.num_worlds, self._batch.nthread, self._warnings)
+        made = (self.model, self.num_worlds, self._batch.nthread, self._warnings, self._own_models)
         return {"made": made, "worlds": self.get_state()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._start(*state["made"])
         self.set_state(state["worlds"])
 
-    def _own(self) -> batch.Batch:
-        """The batch, with threads of this process: those of a parent are not there after a fork."""
+    def _ready(self) -> batch.Batch:
+        """The batch with the models of its worlds, and threads of this process: a fork leaves those of the parent."""
         if self._process != os.getpid():
             inherited = self._batch
             # its end would wait for threads that are not there: it is never freed
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(inherited))
             self.__setstate__(self.__getstate__())
+        if not self._are_given:
+            self._batch.set_models(self._own_models)
+            self._are_given = True
         return self._batch
 
     def get_state(self) -> dict[str, Any]:
@@ -234,19 +260,29 @@ class ManyWorlds:
         self._varied.add(field)
         return self._batch.expand(field)
 
+    def take(self, world: int, model: mujoco.MjModel) -> None:
+        """See `Simulation`."""
+        if self._own_models is None:
+            self._own_models = [self.model] * self.num_worlds
+        self._own_models[world], self._are_given = model, False
+
+    def model_of(self, world: int) -> mujoco.MjModel:
+        """The model of a world with all that is its own, for reading."""
+        return self._ready().get_model(world)
+
     def advance(self, num_substeps: int) -> None:
         """See `Simulation`."""
-        self._own().step(nstep=num_substeps)
+        self._ready().step(nstep=num_substeps)
 
     def restart(self, worlds: BoolArray) -> None:
         """See `Simulation`."""
         if worlds.any():
-            self._own().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+            self._ready().reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
 
     def refresh(self, worlds: BoolArray) -> None:
         """See `Simulation`."""
         if worlds.any():
-            self._own().forward(worlds)
+            self._ready().forward(worlds)
 
     def diverged(self) -> BoolArray:
         """See `Simulation`."""

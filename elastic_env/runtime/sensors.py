@@ -108,9 +108,18 @@ class InertialSensor(Model):
         return math.hypot(by_accelerometer, self.gyro_bias_rad_s * self.time_constant_s)
 
 
-def quantise(angle: Array, counts_per_turn: int | None) -> Array:
-    """Angle of an encoder with whole counts [rad]; None leaves the angle as it is."""
-    return in_whole_counts(angle, angle_of_count(counts_per_turn))
+def quantise(angle: Array, count_rad: Array | float) -> Array:
+    """Angle of an encoder in whole counts.
+
+    Args:
+        angle: (...) [rad].
+        count_rad: Angle of a count, one for all or what goes with the shape of `angle` [rad]; 0 for none.
+
+    Returns:
+        (...) [rad].
+    """
+    has_counts = np.asarray(count_rad) > 0.0
+    return np.where(has_counts, in_whole_counts(angle, np.where(has_counts, count_rad, 1.0)), angle)
 
 
 def angle_of_count(counts_per_turn: int | None) -> float:

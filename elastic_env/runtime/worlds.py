@@ -91,6 +91,7 @@ class Worlds(Stateful):
     def set_state(self, state: dict[str, Any]) -> None:
         """See `Stateful`."""
         super().set_state(state)
+        self.task.furnish(self.simulation)
         self._is_begun = bool(self._begun.all())
 
     @property

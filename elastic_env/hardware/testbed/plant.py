@@ -182,6 +182,14 @@ class ServoPlant:
         """
         raise HardwareError(f"{field!r} of hardware cannot be varied")
 
+    def take(self, world: int, model: mujoco.MjModel) -> None:
+        """Hardware has no other model than the one it is.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError(f"world {world} of hardware cannot take a model of {model.nbody} bodies")
+
     def _opened(self) -> SupervisedBus:
         settings = self.settings
         if self._bus is None:

@@ -1,14 +1,13 @@
 """Parameters of the walking task, and the true robot that a scenario makes of the assumed one."""
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import mujoco
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, ElasticError
@@ -19,7 +18,15 @@ from elastic_env.joint.joint_names import spring_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.walk_plan import plan_walk
-from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, add_load, biped, elastic_spec, place_load
+from elastic_env.robots.thormang.model import (
+    DRAWN_LOAD,
+    LEG_JOINTS,
+    Thormang,
+    add_load,
+    biped,
+    elastic_spec,
+    place_load,
+)
 from elastic_env.robots.thormang.standing import Equilibrium, settle
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.scenario import Scenario, make_scenario
@@ -48,6 +55,9 @@ class WalkConfig(Model):
 
     gait: Gait = Gait()
     scenario: Scenario = make_scenario("nominal")
+    """Of all worlds, or of the first one where each has its own."""
+    scenarios: tuple[Scenario, ...] = ()
+    """Of every world of a vector environment, where they differ; with the same friction and rate of the IMU."""
     robot: Thormang = Thormang()
     joints: tuple[ElasticJoint, ...] = tuple(Thormang().joints.values())
     """The leg joints in order, as they are known; the scenario says in what the true ones differ."""
@@ -59,6 +69,36 @@ class WalkConfig(Model):
     timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
     reward: WalkRewardWeights = WalkRewardWeights()
     bank: int = quantity("1", 0, ge=0, description="bank of robots that a scenario draws from")
+    spare_bodies: int = quantity(
+        "1", 0, ge=0, description="massless bodies on the torso, which give robots with other loads as many bodies"
+    )
+
+    @model_validator(mode="after")
+    def _worlds_know_the_same(self) -> Self:
+        for name, known in (
+            ("friction_scale", lambda scenario: scenario.friction_scale),
+            ("rate_hz of pelvis_imu", lambda scenario: scenario.pelvis_imu.rate_hz),
+        ):
+            values = {known(scenario): scenario.name for scenario in self.scenarios}
+            if len(values) > 1:
+                raise ValueError(
+                    f"the scenarios of all worlds must have the same {name}, got "
+                    + " and ".join(f"{value:g} of {scenario!r}" for value, scenario in values.items())
+                )
+        return self
+
+    def of_each_scenario(self) -> "list[WalkConfig]":
+        """The configuration of the worlds of each scenario, in the order in which these first occur."""
+        if not self.scenarios:
+            return [self]
+        alone = [self.replace(scenario=scenario, scenarios=()) for scenario in dict.fromkeys(self.scenarios)]
+        most = max(config.loads for config in alone)
+        return [config.replace(spare_bodies=most - config.loads) for config in alone]
+
+    @property
+    def loads(self) -> int:
+        """Bodies that loads on the torso are."""
+        return (self.true_robot.torso_load_kg > 0.0) + bool(self.scenario.ranges)
 
     @property
     def assumed_joints(self) -> dict[str, ElasticJoint]:
@@ -92,7 +132,9 @@ class WalkConfig(Model):
         """The plant, what is drawn aside; where loads are drawn, with a load of no mass."""
         spec = elastic_spec(self.true_robot, self.true_joints, self.form, self.timestep_s)
         if self.scenario.ranges:
-            add_load(spec, 0.0, np.zeros(3))
+            add_load(spec, DRAWN_LOAD, 0.0, np.zeros(3))
+        for number in range(self.spare_bodies):
+            add_load(spec, f"spare_{number}", 0.0, np.zeros(3))
         if ACCELEROMETER in self.sensors:
             add_accelerometer(spec, "imu")
         return spec.compile()
@@ -100,8 +142,8 @@ class WalkConfig(Model):
 
 BANK_SIZE, RANGES_BANK_SIZE = 64, 256
 """Robots in the bank of a scenario that draws them: of a named one, and of one with ranges."""
-_SETTLED = 4096
-"""Robots that are kept with their state at rest, of 10 kB each at most."""
+_SETTLED = 2048
+"""Robots that are kept with their state at rest, of 50 kB each."""
 
 
 @lru_cache(maxsize=64)
@@ -125,11 +167,11 @@ class PlacedRobot:
     """A robot of the bank at rest.
 
     Attributes:
-        fields: Of `MjModel`, by name, in which robots of the bank differ.
+        model: Its plant.
         rest: Where it stands under zero offset.
     """
 
-    fields: Mapping[str, Array]
+    model: mujoco.MjModel
     rest: Equilibrium
 
 
@@ -149,8 +191,7 @@ def placed_robot(config: WalkConfig, draw: RobotDraw) -> PlacedRobot:
         if not config.scenario.ranges:
             raise
         raise ConfigurationError(f"the drawn robot {draw} cannot walk: {error}; narrow the ranges") from None
-    fields = {name: getattr(model, name).copy() for name in drawn_fields(config.scenario)}
-    return PlacedRobot({name: values for name, values in fields.items() if values.size}, rest)
+    return PlacedRobot(model, rest)
 
 
 def drawn_model(config: WalkConfig, draw: RobotDraw) -> mujoco.MjModel:
@@ -168,22 +209,6 @@ def drawn_model(config: WalkConfig, draw: RobotDraw) -> mujoco.MjModel:
     if config.scenario.ranges:
         place_load(model, draw.load_kg, np.array(draw.load_place_m))
     return model
-
-
-def drawn_fields(scenario: Scenario) -> tuple[str, ...]:
-    """Fields of `MjModel` in which the robots of a scenario's bank differ."""
-    if scenario.ranges:
-        return _FIELDS_OF_RANGES
-    spread = ("tendon_stiffness",) if scenario.stiffness_spread > 0.0 else ()
-    return (*spread, "body_quat") if scenario.slope_rad > 0.0 else spread
-
-
-_FIELDS_OF_RANGES = (
-    "tendon_stiffness", "tendon_damping", "tendon_lengthspring", "dof_frictionloss", "dof_damping",
-    "body_quat", "body_pos", "body_mass", "body_inertia",
-    # which MuJoCo computes from the masses
-    "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0",
-)  # fmt: skip
 
 
 @lru_cache(maxsize=64)

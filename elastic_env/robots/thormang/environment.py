@@ -22,7 +22,7 @@ _GAIT = ("lift_m", "hip_height_m", "transfer")
 def configure_walk(
     step_period: float | list[float] | tuple[float, float, float] | Gait = 3.0,
     num_steps: int | None = None,
-    scenario: str | Scenario = "nominal",
+    scenario: str | Scenario | list[str | Scenario] = "nominal",
     stiffness: float | str | Path | list[float] | None = None,
     joint: ElasticJoint | dict[str, Any] | None = None,
     robot: Thormang | dict[str, Any] | None = None,
@@ -38,7 +38,8 @@ def configure_walk(
     Args:
         step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support [s], or a `Gait`.
         num_steps: Number of steps; default 4, or that of the `Gait`.
-        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`; or in a vector environment a list with
+            one of them for each world.
         stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an `identification.json`; default
             that of the joints.
         joint: Elastic joint for all twelve, or a mapping of what differs from the paper's H54-200-S500-R, the default.
@@ -68,16 +69,21 @@ def configure_walk(
     if stiffness is not None:
         joints = with_stiffness(joints, read_stiffness(stiffness))
     steps = {} if num_steps is None else {"num_steps": num_steps}
+    is_list = isinstance(scenario, list | tuple)
+    scenarios = [make_scenario(own) for own in scenario] if is_list else [make_scenario(scenario)]
+    if not scenarios:
+        raise ConfigurationError("scenario must be a name, or a list with one for each world, got an empty list")
     return WalkConfig(
         gait=make_gait(step_period, **steps, **(gait or {})),
-        scenario=make_scenario(scenario),
+        scenario=scenarios[0],
+        scenarios=tuple(scenarios) if is_list else (),
         robot=chosen,
         joints=tuple(joints.values()),
         form=form,
         sensors=tuple(sensors),
         reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
         bank=bank,
-        **({} if timestep_s is None else {"timestep_s": timestep_s}),
+        **({} if timestep_s is None else dict[str, Any](timestep_s=timestep_s)),
     )
 
 

@@ -153,16 +153,17 @@ DRAWN_LOAD = "drawn_load"
 """Body of the load that a scenario draws."""
 
 
-def add_load(spec: mujoco.MjSpec, mass: float, place: Array) -> None:
-    """Fix a `DRAWN_LOAD` to the upper body.
+def add_load(spec: mujoco.MjSpec, name: str, mass: float, place: Array) -> None:
+    """Fix a load to the upper body.
 
     Args:
         spec: The robot.
+        name: Of the body that the load is.
         mass: Of the load [kg].
         place: From the center of mass of the upper body, (3,) [m].
     """
     torso = spec.body(_TORSO)
-    load = torso.add_body(name=DRAWN_LOAD, pos=torso.ipos + place, mass=mass, explicitinertial=True)
+    load = torso.add_body(name=name, pos=torso.ipos + place, mass=mass, explicitinertial=True)
     load.ipos, load.inertia = np.zeros(3), np.full(3, mass * _LOAD_GYRATION_M**2)
 
 

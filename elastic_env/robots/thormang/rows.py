@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.model import LEG_JOINTS
@@ -156,7 +157,7 @@ class WalkTruth:
         pelvis_R: Orientation of the pelvis, (num_worlds, 3, 3).
         ankles: Positions of the ankles, (num_worlds, 2, 3) [m].
         stiffness: True K, (num_worlds, 12) [N·m/rad].
-        model: The true joints and masses, what is drawn aside.
+        models: The true joints and masses of the worlds of each scenario, what is drawn aside.
     """
 
     theta: Array
@@ -167,4 +168,18 @@ class WalkTruth:
     pelvis_R: Array
     ankles: Array
     stiffness: Array
-    model: WalkerModel
+    models: tuple[WalkerModel, ...]
+
+    @property
+    def model(self) -> WalkerModel:
+        """The true joints and masses of all worlds.
+
+        Raises:
+            ConfigurationError: The worlds have several scenarios.
+        """
+        model, *others = self.models
+        if others:
+            raise ConfigurationError(
+                f"the worlds of {len(self.models)} scenarios have no true model in common; make an environment for each"
+            )
+        return model

@@ -55,12 +55,15 @@ plan's world frame, x forward, y to the left:
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.draws import Draws
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
 from elastic_env.core.state import Stateful
@@ -74,6 +77,7 @@ from elastic_env.robots.thormang import NAME
 from elastic_env.robots.thormang.config import (
     FALL_HEIGHT_SHARE,
     FALL_TILT_RAD,
+    PlacedRobot,
     WalkConfig,
     placed_robot,
     require_stable_walker,
@@ -113,6 +117,35 @@ UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """The robots of one scenario.
+
+    Attributes:
+        config: Of their worlds, which have no other scenario.
+        bank: What they are drawn from.
+        model: Their plant, what is drawn aside.
+        true_model: Their true joints and masses.
+    """
+
+    config: WalkConfig
+    bank: Sequence[RobotDraw]
+    model: mujoco.MjModel
+    true_model: WalkerModel
+
+    @staticmethod
+    def of(config: WalkConfig, plan: WalkPlan, table: SignalTable) -> "_Kind":
+        """Those of a configuration, a planned motion, and what is observed."""
+        require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+        bank = robot_bank(config.scenario, config.bank)
+        return _Kind(config, bank, config.true_model(), _true_model(config, plan, table))
+
+    @property
+    def fits(self) -> list[tuple[bool, bool]]:
+        """Whether measurements are delayed, and whether the IMU is inertial, as far as robots of the bank have it."""
+        return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
+
+
 class WalkTask(Stateful):
     """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.runtime.task.Task`."""
 
@@ -132,7 +165,12 @@ class WalkTask(Stateful):
         self.num_worlds = num_worlds
         self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         counts = next(iter(config.true_joints.values())).encoder_counts_per_turn
-        self._sensors = FurtherSensors(config.sensors, JOINTS, config.scenario, counts, num_worlds)
+        scenarios = config.scenarios or (config.scenario,) * num_worlds
+        if len(scenarios) != num_worlds:
+            raise ConfigurationError(
+                f"scenario must be a name, or a list with one for each world, {num_worlds}, got {len(scenarios)}"
+            )
+        self._sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
         table = self.observation_table = OBSERVATION.extended(self._sensors.signals)
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
@@ -140,40 +178,26 @@ class WalkTask(Stateful):
             config.assumed_joints, robot.rigid, config.control_period_s, table, biped=robot, plan=self.plan
         )
         require_feasible(self.plan, robot, model.servos)
-        self._true_model = _true_model(config, self.plan, table)
-        require_stable_walker(config)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        self.model = config.true_model()
-        self._bank = robot_bank(config.scenario, config.bank)
-        self._fits = list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self._bank))
-        feet = [self.model.body(f"{side}_foot").id for side in SIDES]
-        sensors = FootSensors(self.model.body_mass[feet], self.model.body_ipos[feet], self.model.opt.gravity.copy())
-        sites = np.array([self.model.site(f"{side}_ft").id for side in SIDES])
+        self._kinds = [_Kind.of(own, self.plan, table) for own in config.of_each_scenario()]
+        number = {kind.config.scenario: index for index, kind in enumerate(self._kinds)}
+        self._kind_of_world = [self._kinds[number[scenario]] for scenario in scenarios]
+        self.model = self._kinds[0].model
         self._torso = self.model.body("upper_body").id
-        weight = float(self.model.body_mass.sum()) * robot.gravity
-        # sensors that carry nothing stand for a ground that carries the feet
-        least_n = UNLOADED_SHARE * weight + float(self.model.body_mass[feet].sum()) * robot.gravity
         n, m = num_worlds, len(LEG_JOINTS)
         self.num_steps = self.plan.num_steps
         """Control steps of an episode."""
         self._phases, self._bias = _phase_rows(self.plan), np.zeros(n, BIAS)
-        joints = JointAddresses.of(self.model, LEG_JOINTS)
-        at = one(
-            ADDRESSES, theta=joints.theta, q=joints.q, theta_dot=joints.theta_dot, q_dot=joints.q_dot, ankles=sites
-        )
-        counts = self._true_model.encoder_counts_per_turn
-        rules = _rules(config, UNLOADED_SHARE * weight, least_n)
+        self._fits = [(kind, *fit) for kind in self._kinds for fit in kind.fits]
         self._constants = np.concatenate([
-            one(
-                CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
-                quality=_quality(_fitted(config.scenario, is_inertial), counts),
-                rules=_delayed(rules, is_delayed),
-            )
-            for is_delayed, is_inertial in self._fits
+            _constants(kind, is_delayed, is_inertial) for kind, is_delayed, is_inertial in self._fits
         ])  # fmt: skip
-        self._inertial = _inertial(config.scenario, [is_inertial for _, is_inertial in self._fits], robot.gravity)
+        self._inertial = _inertial(self._fits, robot.gravity)
         self._plan_rows = _plan_rows(self.plan, config)
         self._draw = np.zeros(n, dtype=np.int64)
-        self._pushes = any(robot.push_n > 0.0 for robot in self._bank)
+        self._pushes = any(robot.push_n > 0.0 for kind in self._kinds for robot in kind.bank)
+        self._push_steps = np.array([
+            round(kind.config.scenario.push_s / config.control_period_s) for kind in self._kind_of_world
+        ])  # fmt: skip
         self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
         self._noise = NoiseStream(n, NOISE)
         self._rows = self._rows_before = np.zeros(n, STEP)
@@ -184,7 +208,6 @@ class WalkTask(Stateful):
 
     def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
         """Place robots in static equilibrium under zero offset."""
-        scenario = self.config.scenario
         simulation.views(kernels.Physics._fields)
         simulation.bind("xfrc_applied")[worlds] = 0.0
         # the samples of the steps before keep theirs
@@ -195,9 +218,9 @@ class WalkTask(Stateful):
         truth["offset"][worlds], truth["command_rate"][worlds] = 0.0, 0.0
         truth["command"][worlds] = self.plan.q[0]
         for world in np.flatnonzero(worlds).tolist():
-            generator = draws[world].robot
-            self._draw[world] = generator.integers(len(self._bank))
-            mounting = scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+            generator, kind = draws[world].robot, self._kind_of_world[world]
+            self._draw[world] = generator.integers(len(kind.bank))
+            mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
             self._bias["imu_attitude"][world] = mounting + np.array(self._robot(world).imu_bias_rad)
             self._draw_push(world, draws[world])
             self._noise.restart(world, draws[world].noise())
@@ -233,9 +256,8 @@ class WalkTask(Stateful):
     def disturb(self, simulation: Simulation) -> None:
         """Push the torso where and when the scenario says."""
         if self._pushes:
-            steps = round(self.config.scenario.push_s / self.config.control_period_s)
             since = self._rows["truth"]["step"] - self._push_begin
-            active = (since >= 0) & (since < steps)
+            active = (since >= 0) & (since < self._push_steps)
             simulation.bind("xfrc_applied")[:, self._torso, :3] = np.where(active[:, None], self._push_force, 0.0)
 
     def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
@@ -348,11 +370,12 @@ class WalkTask(Stateful):
         s = self._rows["truth"]
         names = "theta", "theta_dot", "q", "q_dot", "pelvis", "ankles", "stiffness"
         copies = {name: s[name].copy() for name in names}
-        return WalkTruth(**copies, pelvis_R=rotation_of(s["quaternion"]), model=self._true_model)
+        models = tuple(kind.true_model for kind in self._kinds)
+        return WalkTruth(**copies, pelvis_R=rotation_of(s["quaternion"]), models=models)
 
     def robot_record(self, world: int) -> dict[str, float]:
         """The robot of a world in figures, where it was drawn from ranges; else nothing."""
-        return self._robot(world).record() if self.config.scenario.ranges else {}
+        return self._robot(world).record() if self._kind_of_world[world].config.scenario.ranges else {}
 
     def _row(self, sample: WalkSample) -> IntArray:
         """Rows of the plan's tables."""
@@ -377,7 +400,8 @@ class WalkTask(Stateful):
 
     def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
         """Errors of an inertial IMU, where one is fitted."""
-        sensor, bias = _fitted(self.config.scenario, self._robot(world).is_inertial).inertial, self._bias
+        scenario, bias = self._kind_of_world[world].config.scenario, self._bias
+        sensor = _fitted(scenario, self._robot(world).is_inertial).inertial
         bias["gyro"][world] = bias["specific_force"][world] = 0.0
         if sensor is not None:
             bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
@@ -386,16 +410,25 @@ class WalkTask(Stateful):
 
     def _robot(self, world: int) -> RobotDraw:
         """The robot of a world."""
-        return self._bank[self._draw[world]]
+        return self._kind_of_world[world].bank[self._draw[world]]
+
+    def furnish(self, simulation: Simulation) -> None:
+        """See `Task`."""
+        for world in range(self.num_worlds):
+            simulation.take(world, self._placed(world).model)
+
+    def _placed(self, world: int) -> PlacedRobot:
+        """The robot of a world, at rest."""
+        config = self._kind_of_world[world].config
+        return placed_robot(config, self._robot(world))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
 
     def _place(self, simulation: Simulation, world: int, truth: Records) -> None:
         """Give a world its robot, at rest, and its truth the robot's joints."""
-        robot, model, bias = self._robot(world), self._true_model, self._bias
+        robot, kind, bias = self._robot(world), self._kind_of_world[world], self._bias
+        model, placed = kind.true_model, self._placed(world)
         bias["encoder"][world] = robot.encoder_bias_rad
-        bias["fit"][world] = self._fits.index((robot.is_delayed, robot.is_inertial))
-        placed = placed_robot(self.config, robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-        for name, values in placed.fields.items():
-            simulation.vary(name)[world] = values
+        bias["fit"][world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
+        simulation.take(world, placed.model)
         simulation.qpos[world] = placed.rest.qpos
         simulation.qvel[world] = 0.0
         simulation.act[world] = placed.rest.act
@@ -446,22 +479,41 @@ def _observed(n: int) -> tuple[Array, Records]:
     return columns, np.ndarray(n, OBSERVED, columns)
 
 
-def _rules(config: WalkConfig, loaded_n: float, zmp_n: float) -> Records:
+def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:
+    """What does not change of a robot, one row of `CONSTANTS`.
+
+    Args:
+        kind: Robots of its scenario.
+        is_delayed: Whether its measurements are shown a step late.
+        is_inertial: Whether its IMU computes its attitude.
+    """
+    config, model = kind.config, kind.model
+    feet = [model.body(f"{side}_foot").id for side in SIDES]
+    sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
+    joints, gravity = JointAddresses.of(model, LEG_JOINTS), biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+    at = one(
+        ADDRESSES, theta=joints.theta, q=joints.q, theta_dot=joints.theta_dot, q_dot=joints.q_dot,
+        ankles=np.array([model.site(f"{side}_ft").id for side in SIDES]),
+    )  # fmt: skip
+    loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * gravity
+    # sensors that carry nothing stand for a ground that carries the feet
+    zmp_n = loaded_n + float(model.body_mass[feet].sum()) * gravity
+    return one(
+        CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
+        quality=_quality(_fitted(config.scenario, is_inertial), kind.true_model.encoder_counts_per_turn),
+        rules=_rules(config, is_delayed, loaded_n, zmp_n),
+    )  # fmt: skip
+
+
+def _rules(config: WalkConfig, is_delayed: bool, loaded_n: float, zmp_n: float) -> Records:
     """Numbers that judge a control step, one row of `RULES`."""
     weights = one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()})
     return one(
-        RULES, control_period_s=config.control_period_s, is_delayed=False,
+        RULES, control_period_s=config.control_period_s, is_delayed=is_delayed,
         loaded_n=loaded_n, zmp_n=zmp_n, weights=weights,
         lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m, highest_tilt_rad=FALL_TILT_RAD,
         highest_rad_s=DIVERGED_RAD_S,
     )  # fmt: skip
-
-
-def _delayed(rules: Records, is_delayed: bool) -> Records:
-    """The same rules for a robot whose measurements are shown a step late, or at once."""
-    found = rules.copy()
-    found["is_delayed"] = is_delayed
-    return found
 
 
 def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
@@ -471,17 +523,15 @@ def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
     return scenario.replace(ranges=(), inertial=scenario.inertial or InertialSensor())
 
 
-def _inertial(scenario: Scenario, is_fitted: Sequence[bool], gravity_m_s2: float) -> Records | None:
-    """The inertial IMUs of the robots, rows of `INERTIAL`; None where no robot has one."""
-    if not any(is_fitted):
+def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> Records | None:
+    """The inertial IMUs of robots as `WalkTask` lists them, rows of `INERTIAL`; None where no robot has one."""
+    if not any(is_inertial for _, _, is_inertial in fits):
         return None
-    sensor = scenario.inertial or InertialSensor()
-    return np.concatenate(
-        [
-            one(INERTIAL, is_fitted=fitted, time_constant_s=sensor.time_constant_s, gravity_m_s2=gravity_m_s2)
-            for fitted in is_fitted
-        ]
-    )
+    sensors = [kind.config.scenario.inertial or InertialSensor() for kind, _, _ in fits]
+    return np.concatenate([
+        one(INERTIAL, is_fitted=fit[2], time_constant_s=sensor.time_constant_s, gravity_m_s2=gravity_m_s2)
+        for fit, sensor in zip(fits, sensors, strict=True)
+    ])  # fmt: skip
 
 
 def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:

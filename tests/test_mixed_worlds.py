@@ -1,0 +1,112 @@
+"""Worlds of several scenarios in one vector environment, against environments of one scenario each."""
+
+import copy
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import baselines
+import elastic_env  # noqa: F401  registers the environments
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.signals import Array
+
+ID = "elastic_env/WalkInPlace-v0"
+SHORT: dict[str, Any] = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
+SCENARIOS = ["nominal", "soft", "spread", "payload", "sensor", "slope", "push", "imu", "drawn", "soft+backlash"]
+SENSORS = ["link_encoder", "joint_torque", "accelerometer"]
+EACH = 2
+
+
+def worlds(scenario: str | list[str], num_envs: int, **options: Any) -> Any:
+    """A vector environment of a short walk."""
+    return gymnasium.make_vec(
+        ID, num_envs=num_envs, vectorization_mode="vector_entry_point", num_threads=2, scenario=scenario,
+        **SHORT, **options,
+    )  # fmt: skip
+
+
+def mixed(scenarios: list[str], **options: Any) -> Any:
+    """`EACH` worlds of every scenario."""
+    return worlds([scenario for scenario in scenarios for _ in range(EACH)], EACH * len(scenarios), **options)
+
+
+def played(env: Any, seeds: list[int], offsets: Array) -> list[Array]:
+    """Observations, rewards and signals of a walk from given seeds, under offsets, (steps, worlds, 12) [rad]."""
+    observation, info = env.reset(seed=seeds)
+    found = [observation]
+    for offset in offsets:
+        observation, reward, *_, info = env.step(offset)
+        found += [observation, reward, info["zmp_deviation"], info["pelvis_error"], info["joint_torque"]]
+    return [*found, *env.unwrapped.truth().stiffness.T]
+
+
+def some_offsets(steps: int, num_worlds: int) -> Array:
+    """Offsets that move all joints, by some mrad."""
+    generator = np.random.default_rng(7)
+    return np.cumsum(generator.uniform(-2e-3, 2e-3, (steps, num_worlds, 12)), axis=0).clip(-0.02, 0.02)
+
+
+@pytest.mark.parametrize("sensors", [[], SENSORS])
+def test_a_world_is_the_same_beside_worlds_of_other_scenarios(sensors: list[str]) -> None:
+    """Catches a scenario that takes its plant, bank, sensors, push or noise from another one, in any bit."""
+    seeds, offsets = list(range(EACH * len(SCENARIOS))), some_offsets(150, EACH * len(SCENARIOS))
+    together = played(mixed(SCENARIOS, sensors=sensors), seeds, offsets)
+    for index, scenario in enumerate(SCENARIOS):
+        own = slice(EACH * index, EACH * (index + 1))
+        alone = played(worlds(scenario, EACH, sensors=sensors), seeds[own], offsets[:, own])
+        for one, other in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(one[own], other, err_msg=scenario)
+
+
+def test_a_mixture_goes_on_from_its_state_and_as_a_copy() -> None:
+    """Catches models of drawn robots that a checkpoint, or a copy, does not have."""
+    names = ["spread", "payload", "drawn", "slope"]
+    first, offsets = mixed(names), some_offsets(60, EACH * len(names))
+    played(first, [5, 6, 7, 8, 9, 10, 11, 12], offsets[:30])
+    second = mixed(names)
+    second.reset(seed=99)
+    second.unwrapped.set_state(first.unwrapped.get_state())
+    third = copy.deepcopy(first.unwrapped)
+    for offset in offsets[30:]:
+        shown = [env.step(offset)[0] for env in (first, second, third)]
+        np.testing.assert_array_equal(shown[1], shown[0])
+        np.testing.assert_array_equal(shown[2], shown[0])
+
+
+def test_a_single_walker_goes_on_from_its_state_with_its_robot() -> None:
+    """Catches the robot of another episode behind a state that was put back."""
+    env, twin = (gymnasium.make(ID, scenario="drawn", **SHORT).unwrapped for _ in range(2))
+    env.reset(seed=3)
+    twin.reset(seed=4)
+    twin._worlds.set_state(env._worlds.get_state())  # type: ignore[attr-defined]
+    for _ in range(20):
+        shown = [one.step(np.full(12, 1e-3, np.float32))[0] for one in (env, twin)]
+        np.testing.assert_array_equal(shown[1], shown[0])
+
+
+def test_policies_play_in_a_mixture_and_the_oracle_is_told_that_it_cannot() -> None:
+    """Catches an oracle that takes one scenario's parameters for those of all."""
+    env = mixed(["nominal", "soft"])
+    env.reset(seed=0)
+    assert env.unwrapped.assumed_model.stiffness.shape == (12,)
+    with pytest.raises(ConfigurationError, match="2 scenarios have no true model in common"):
+        baselines.make("oracle", env)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "problem"),
+    [
+        (["nominal", "soft", "soft"], r"one for each world, 2, got 3"),
+        ([], "empty list"),
+        (["nominal", "ideal"], "same friction_scale, got 1 of 'nominal' and 0 of 'ideal'"),
+        (["nominal", "sloppy"], "sloppy"),
+    ],
+)
+def test_a_list_that_does_not_fit_is_an_error_with_what_it_has(scenario: list[str], problem: str) -> None:
+    """Catches a list that is repeated or cut, and worlds whose policies would have to know different friction."""
+    with pytest.raises(ConfigurationError, match=problem):
+        worlds(scenario, 2)
+    with pytest.raises(ConfigurationError):
+        gymnasium.make(ID, scenario=["nominal", "soft"])
