@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from train.cells.play import run_conditions
 from train.cells.store import Store
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.evaluate import Evaluation, evaluate, evaluate_together
 from train.learn.run_training import start
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
@@ -130,11 +130,11 @@ def test_only_what_is_missing_is_played(tmp_path: Path, monkeypatch: pytest.Monk
     """Catches a policy that is added and has all others played again."""
     store, played = Store(tmp_path), list[str]()
 
-    def noted(condition: Condition, **options: Any) -> Evaluation:
-        played.append(condition.policy.name)
-        return evaluate(condition, **options)
+    def noted(conditions: Sequence[Condition], *options: Any) -> list[Evaluation]:
+        played.extend(condition.policy.name for condition in conditions)
+        return evaluate_together(conditions, *options)
 
-    monkeypatch.setattr("train.cells.play.evaluate", noted)
+    monkeypatch.setattr("train.cells.play.evaluate_together", noted)
     run_conditions(CONDITIONS[:1], Console(quiet=True), store=store)
     run_conditions(CONDITIONS, Console(quiet=True), store=store)
     assert played == ["uncompensated", "input"]
@@ -163,13 +163,13 @@ def test_a_cell_whose_policy_changed_while_it_was_played_is_not_kept(
     Path("mine.py").write_text("import baselines\n\ndef make(env):\n    return baselines.make('input', env)\n")
     condition, store = CONDITIONS[0].replace(policy=PolicySpec(name="mine.py:make")), Store(tmp_path / "cells")
 
-    def edited(condition: Condition, **options: Any) -> Evaluation:
-        result = evaluate(condition, **options)
+    def edited(conditions: Sequence[Condition], *options: Any) -> list[Evaluation]:
+        result = evaluate_together(conditions, *options)
         Path("mine.py").write_text("import baselines\n\ndef make(env):\n    return baselines.make('zero', env)\n")
         return result
 
     with monkeypatch.context() as context:
-        context.setattr("train.cells.play.evaluate", edited)
+        context.setattr("train.cells.play.evaluate_together", edited)
         run_conditions([condition], Console(width=200), store=store)
     assert "is not kept: a file that it names changed" in capsys.readouterr().out
     assert store.get(condition) is None

@@ -9,8 +9,13 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
+from baselines.compensation.policy import Zero
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from train.cells import play
+from train.cells.play import in_batches
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.evaluate import evaluate, evaluate_together
 
 ID = "elastic_env/WalkInPlace-v0"
 SHORT: dict[str, Any] = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
@@ -110,3 +115,74 @@ def test_a_list_that_does_not_fit_is_an_error_with_what_it_has(scenario: list[st
         worlds(scenario, 2)
     with pytest.raises(ConfigurationError):
         gymnasium.make(ID, scenario=["nominal", "soft"])
+
+
+def cell(policy: str, scenario: str, episodes: int = 2, **changes: Any) -> Condition:
+    """A cell of a comparison of short walks."""
+    return Condition(
+        env="walker", policy=PolicySpec(name=policy), reference={"step_period": [0.2, 0.3, 0.2], "num_steps": 2},
+        scenario=scenario, episodes=episodes, seed=4, **changes,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("policy", ["adaptive_posture", "link_encoder", "thormang", "residual:walker_3s_offset/seed_0"])
+def test_cells_that_are_played_together_are_what_they_are_alone(policy: str) -> None:
+    """Catches policies, scores, traces and seeds that depend on the worlds beside."""
+    cells = [cell(policy, scenario) for scenario in ("nominal", "payload", "drawn", "imu")]
+    for one, condition in zip(evaluate_together(cells, num_threads=2), cells, strict=True):
+        other = evaluate(condition, num_threads=1)
+        assert one.condition == condition
+        assert one.episodes == other.episodes
+        assert {episode["seed"] for episode in one.episodes} == {4, 5}
+        assert one.trace.keys() == other.trace.keys()
+        for name, values in one.trace.items():
+            np.testing.assert_array_equal(values, other.trace[name], err_msg=name)
+
+
+def test_batches_hold_cells_of_one_policy_and_leave_work_for_every_core() -> None:
+    """Catches cells that are lost, that no environment can have in common, and one core that waits for the others."""
+    scenarios = ("ideal", "nominal", "soft", "push", "slope", "spread")
+    cells = [cell(name, scenario) for scenario in scenarios for name in ("input", "oracle", "iterative", "dynamic")]
+    batches = in_batches(cells, cores=1)
+    assert sorted(number for batch in batches for number in batch) == list(range(len(cells)))
+    found = [{(cells[number].policy.name, cells[number].scenario) for number in batch} for batch in batches]
+    for policy in ("input", "dynamic"):
+        assert {(policy, "ideal")} in found
+        assert {(policy, scenario) for scenario in scenarios[1:]} in found
+    alone = [batch for batch in found if {"oracle", "iterative"} & {policy for policy, _ in batch}]
+    assert [len(batch) for batch in alone] == [1] * 12
+    assert len(in_batches(cells, cores=8)) >= 16
+    assert all(len(batch) == 1 for batch in in_batches(cells, cores=len(cells)))
+    testbed = [Condition(policy=PolicySpec(name="input"), scenario=name) for name in ("nominal", "soft")]
+    assert in_batches(testbed, cores=1) == [[0], [1]]
+
+
+def test_a_map_of_a_scenario_shares_worlds_and_varied_options_do_not() -> None:
+    """Catches a policy that plays cells of another value of its option."""
+    cells = [cell("input", "nominal", swept={"scenario.stiffness_scale": value}) for value in (0.8, 0.9, 1.0, 1.1)]
+    assert in_batches(cells, cores=1) == [[0, 1], [2, 3]]
+    cells = [cell("input", "nominal", swept={"stiffness_scale": value}) for value in (0.8, 0.9, 1.0, 1.1)]
+    assert in_batches(cells, cores=1) == [[0], [1], [2], [3]]
+
+
+def failing(env: Any) -> Any:
+    """A policy that raises in worlds with a load."""
+
+    class Failing(Zero):
+        def predict(self, observation: Any, *rest: Any, **named: Any) -> Any:
+            if env.unwrapped.task.model.body_mass.sum() > 60.0:
+                raise ValueError("too heavy")
+            return super().predict(observation, *rest, **named)
+
+    return Failing(env.unwrapped.task.observation_table)
+
+
+def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a failure in one scenario that takes the results of the others with it, or has another's name."""
+    monkeypatch.setattr(play, "plays_beside_others", lambda condition: True)
+    cells = [cell(f"{__name__}:failing", scenario) for scenario in ("payload", "nominal")]
+    failed, passed = play._evaluate(cells, lambda _: None)
+    assert failed.error is not None
+    assert "'payload'" in str(failed.error)
+    assert "too heavy" in str(failed.error)
+    assert passed.value.episodes == evaluate(cells[1], num_threads=1).episodes

@@ -156,13 +156,15 @@ def test_episodes_say_which_robot_was_drawn() -> None:
 def test_a_configuration_names_ranges_for_training_and_evaluation() -> None:
     """Catches ranges that only one of both sees, and robots of evaluation that training meets."""
     config = TrainConfig(env="walker", scenarios=["drawn", "nominal"], ranges=OWN, worlds=4)
-    learned_from: Any = training_worlds(config, config.shares, 1).unwrapped.envs
+    (learned_from,) = training_worlds(config, config.shares, 1).unwrapped.envs  # type: ignore[attr-defined]
     evaluated: Any = make_vector_env(config.condition("drawn", config.base), 2, 1).unwrapped
-    for env in (learned_from[0], evaluated):
-        assert env.task.config.scenario.ranges == (TRAINING_RANGES.replace(load_kg=(0.0, 2.0)),)
-        assert max(robot.load_kg for robot in env.task._bank) <= 2.0
-    assert not set(learned_from[0].task._bank) & set(evaluated.task._bank)
-    assert not learned_from[1].task.config.scenario.ranges
+    trained, nominal = learned_from.task._kinds
+    (scored,) = evaluated.task._kinds
+    for kind in (trained, scored):
+        assert kind.config.scenario.ranges == (TRAINING_RANGES.replace(load_kg=(0.0, 2.0)),)
+        assert max(robot.load_kg for robot in kind.bank) <= 2.0
+    assert not set(trained.bank) & set(scored.bank)
+    assert not nominal.config.scenario.ranges
     again = TrainConfig(**config.model_dump(mode="json"))
     assert again.condition("drawn", "input").scenario_played == config.condition("drawn", "input").scenario_played
 

@@ -113,7 +113,7 @@ def test_records_do_not_depend_on_how_episodes_are_batched(monkeypatch: pytest.M
     """Catches episodes lost or repeated where there are more of them than worlds."""
     cell = condition(reference=MULTISINE, episodes=5)
     whole = evaluate(cell, num_threads=1)
-    monkeypatch.setattr(train.evaluate.evaluate, "_MAX_WORLDS", 2)
+    monkeypatch.setattr(train.evaluate.evaluate, "MOST_WORLDS", 2)
     parts = evaluate(cell, num_threads=1)
     assert parts.episodes == whole.episodes
     np.testing.assert_array_equal(parts.trace["link_angle"], whole.trace["link_angle"])

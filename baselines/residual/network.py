@@ -6,15 +6,13 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from baselines.residual.residual_kernels import affine
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.signals import Array
 
 Tensors = Mapping[str, npt.NDArray[Any]]
 """`mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ..."""
 
-_BLOCK = 32
-"""Rows that are multiplied at once: a larger product would be shared out to threads, which then wait busily for more
-work in the way of the physics."""
 _ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
 _MOST_LAYERS, _LARGEST = 10, 1e6
 _TYPES = ("float32", "float64")
@@ -77,7 +75,8 @@ def _require_numbers(name: str, tensor: npt.NDArray[Any]) -> None:
 class Network:
     """Feed-forward network in single precision, as it was trained: the mean action of normalised features.
 
-    Rows of a batch agree with single rows to rounding only (10⁻⁶): a matrix product may add in another order.
+    A row of a batch is what it is alone, bit for bit, which matrix products of BLAS do not grant. They would also keep
+    threads in the way of the physics.
 
     Args:
         settings: Activation, output and clipping.
@@ -91,7 +90,8 @@ class Network:
         depth = require_network(tensors)
         self._mean, self._std = tensors["mean"].astype(np.float64), tensors["std"].astype(np.float64)
         self._layers = [
-            (tensors[f"weight{i}"].astype(np.float32).T, tensors[f"bias{i}"].astype(np.float32)) for i in range(depth)
+            (np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T), tensors[f"bias{i}"].astype(np.float32))
+            for i in range(depth)
         ]
         self._activation, self._output = _ACTIVATIONS[settings.activation], settings.output
         self._clip = settings.clip
@@ -108,13 +108,9 @@ class Network:
 
     def __call__(self, features: Array) -> Array:
         """Residual in [−1, 1], (num_worlds, features) to (num_worlds, k)."""
-        blocks = [self._forward(features[i : i + _BLOCK]) for i in range(0, len(features), _BLOCK)]
-        return np.concatenate(blocks) if blocks else np.zeros((0, self.num_outputs))
-
-    def _forward(self, features: Array) -> Array:
         x = np.clip((features - self._mean) / self._std, -self._clip, self._clip).astype(np.float32)
         for number, (W, b) in enumerate(self._layers):
-            x = x @ W + b
+            x = affine(x, W, b)
             if number < len(self._layers) - 1:
                 x = self._activation(x)
         x = np.tanh(x) if self._output == "tanh" else np.clip(x, -1.0, 1.0)

@@ -6,6 +6,10 @@ Numba keeps compiled code by the file of the function that was called. So everyt
 file, and every size comes from a type.
 """
 
+from typing import Any
+
+import numpy as np
+
 from elastic_env.core.compiled import compiled
 from elastic_env.core.signals import Array, IntArray
 
@@ -45,3 +49,17 @@ def approach(before: Array, residual: Array, source: IntArray, bounds: Array, sh
             if source[column] >= 0:
                 wanted = bounds[column] * residual[world, source[column]]
             now[world, column] = before[world, column] + share * (wanted - before[world, column])
+
+
+@compiled
+def affine(rows: Any, W: Any, b: Any) -> Any:
+    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up in the same order."""
+    out = np.empty((len(rows), len(b)), dtype=np.float32)
+    for row in range(len(rows)):
+        for j in range(len(b)):
+            out[row, j] = b[j]
+        for i in range(W.shape[0]):  # along the outputs, whose sums are apart, the processor works on several at once
+            x = rows[row, i]
+            for j in range(len(b)):
+                out[row, j] += x * W[i, j]
+    return out

@@ -1,5 +1,6 @@
 """The cells of a comparison, played side by side: what is kept, and what one that fails leaves of the others."""
 
+import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +11,16 @@ from elastic_env.core.errors import ElasticError
 from train.cells.key import cell_key
 from train.cells.store import Store
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import Evaluation, PolicyFailedError, evaluate, num_steps
+from train.evaluate.evaluate import (
+    MOST_WORLDS,
+    Evaluation,
+    PolicyFailedError,
+    evaluate,
+    evaluate_together,
+    in_common,
+    num_steps,
+    plays_beside_others,
+)
 from train.runs.failures import DEFECT, explained
 from train.runs.progress import Show, plain_progress, show_progress
 from train.workers.calls import Outcome, Tally, Watch, run_calls
@@ -70,61 +80,96 @@ def run_conditions(
 
 
 class _Playing:
-    """Conditions that are being played."""
+    """Conditions that are being played, in batches that share worlds."""
 
     def __init__(self, conditions: Sequence[Condition], console: Console, place: Place, store: Store | None) -> None:
         self._conditions, self._console, self._place, self._store = conditions, console, place, store
         steps = num_steps(conditions)
-        self._longest_first = sorted(range(len(conditions)), key=lambda number: -steps[number])
-        self._steps = [steps[number] for number in self._longest_first]
-        self._keys = [] if store is None else [cell_key(conditions[number]) for number in self._longest_first]
-        self._played = [0] * len(conditions)
-        self._note = ""
+        cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
+        batches = [(batch, max(steps[number] for number in batch)) for batch in in_batches(conditions, cores)]
+        longest_first = sorted(batches, key=lambda batch: -batch[1])
+        self._batches, self._steps = [batch for batch, _ in longest_first], [steps for _, steps in longest_first]
+        self._keys = [] if store is None else [cell_key(condition) for condition in conditions]
+        self._played = [0] * len(self._batches)
+        self._running, self._done, self._failed = set[int](), 0, 0
+        self._outcomes: list[Outcome | None] = [None] * len(conditions)
         self._show: Show = lambda *_: None
 
     def results(self) -> list[Outcome | None]:
         """Outcomes in the order of the conditions; None for those that Ctrl-C kept from starting."""
-        ordered = [self._conditions[number] for number in self._longest_first]
         with show_progress(self._console, {"control steps": sum(self._steps)}, transient=True) as self._show:
-            if len(ordered) == 1 and self._place.is_local:  # a process of its own takes seconds to start
-                found: list[Outcome | None] = [self._in_this_process(ordered[0])]
+            if len(self._batches) == 1 and self._place.is_local:  # a process of its own takes seconds to start
+                cells = _evaluate(self._of(0), lambda played: self._reported(0, played), self._place.jobs)
+                self._ended(0, Outcome(cells))
             else:
-                found = self._beside(ordered)
-        return [found[self._longest_first.index(number)] for number in range(len(ordered))]
+                self._beside()
+        return self._outcomes
 
-    def _beside(self, ordered: Sequence[Condition]) -> list[Outcome | None]:
-        watch = Watch(self._reported, self._ended, self._tallied, self._moved)
+    def _of(self, batch: int) -> list[Condition]:
+        return [self._conditions[number] for number in self._batches[batch]]
+
+    def _beside(self) -> None:
+        watch = Watch(self._reported, self._ended, moved=self._moved)
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
-            with self._place.opened(len(ordered), folder) as pool:
-                return run_calls(_evaluate, [(condition,) for condition in ordered], pool, watch)
+            with self._place.opened(len(self._batches), folder) as pool:
+                run_calls(_evaluate, [(self._of(batch),) for batch in range(len(self._batches))], pool, watch)
 
-    def _in_this_process(self, condition: Condition) -> Outcome:
-        try:
-            outcome = Outcome(_evaluate(condition, lambda played: self._reported(0, played), self._place.jobs))
-        except PolicyFailedError as error:
-            return Outcome(error=error.with_traceback(None))
-        self._ended(0, outcome)
-        return outcome
+    def _reported(self, batch: int, played: int) -> None:
+        self._played[batch] = played
+        if self._outcomes[self._batches[batch][0]] is None:  # a report may come behind the end
+            self._running.add(batch)
+        self._show_progress()
 
-    def _reported(self, number: int, played: int) -> None:
-        self._played[number] = played
-        self._show(0, sum(self._played), self._note)
+    def _show_progress(self) -> None:
+        running = sum(len(self._batches[batch]) for batch in self._running)
+        tally = Tally(self._done, running, self._failed, len(self._conditions))
+        self._show(0, sum(self._played), tally.in_words("cells"))
 
-    def _tallied(self, tally: Tally) -> None:
-        self._note = tally.in_words("cells")
-        self._show(0, sum(self._played), self._note)
+    def _ended(self, batch: int, outcome: Outcome) -> None:
+        """Take the outcomes of a batch, or what ended all of it."""
+        self._played[batch] = self._steps[batch]
+        self._running.discard(batch)
+        numbers = self._batches[batch]
+        for number, own in zip(numbers, outcome.value or [outcome] * len(numbers), strict=True):
+            self._outcomes[number] = own
+            self._done += own.error is None
+            self._failed += own.error is not None
+            if own.error is None and self._store is not None and not self._store.keep(own.value, self._keys[number]):
+                name = _name(self._conditions[number])
+                said = f"{name} is not kept: a file that it names changed while it was played"
+                self._console.print(said, soft_wrap=True)
+        self._show_progress()
 
-    def _ended(self, number: int, outcome: Outcome) -> None:
-        self._played[number] = self._steps[number]
-        if outcome.error is not None or self._store is None or self._store.keep(outcome.value, self._keys[number]):
-            return
-        name = _name(self._conditions[self._longest_first[number]])
-        self._console.print(f"{name} is not kept: a file that it names changed while it was played", soft_wrap=True)
+    def _moved(self, batch: int) -> None:
+        for condition in self._of(batch):
+            self._console.print(f"a worker was lost; {_name(condition)} is played again", soft_wrap=True)
 
-    def _moved(self, number: int) -> None:
-        name = _name(self._conditions[self._longest_first[number]])
-        self._console.print(f"a worker was lost; {name} is played again", soft_wrap=True)
+
+def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
+    """Conditions, by their numbers, that are played in one vector environment: many worlds cost less each.
+
+    Args:
+        conditions: What to play.
+        cores: Batches that are played at a time. There are twice as many, if there can be: not all last as long.
+    """
+    worlds = sum(condition.episodes for condition in conditions)
+    most = min(worlds // (2 * cores), MOST_WORLDS)
+    batches: list[list[int]] = []
+    open_batch: dict[str, tuple[list[int], int]] = {}
+    for number, condition in enumerate(conditions):
+        if not plays_beside_others(condition):
+            batches.append([number])
+            continue
+        policy = condition.policy, condition.member, condition.policy_options, condition.reference_name
+        key = repr((policy, in_common(condition)))
+        batch, size = open_batch.get(key, ([], most))
+        if size + condition.episodes > most:
+            batch, size = [], 0
+            batches.append(batch)
+        batch.append(number)
+        open_batch[key] = batch, size + condition.episodes
+    return batches
 
 
 def _said(condition: Condition, outcome: Outcome) -> tuple[str, int]:
@@ -156,8 +201,11 @@ def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluati
     return evaluate(condition, advance)
 
 
-def _evaluate(condition: Condition, report: Callable[[int], None], num_threads: int = 1) -> Evaluation:
-    """An evaluation that reports how many control steps it has played."""
+def _evaluate(conditions: Sequence[Condition], report: Callable[[int], None], num_threads: int = 1) -> list[Outcome]:
+    """Evaluations, side by side, that report how many control steps they have played.
+
+    Where the policy fails beside others, each is played alone, to say which ones it fails in.
+    """
     done = 0
 
     def advance(steps: int) -> None:
@@ -165,4 +213,9 @@ def _evaluate(condition: Condition, report: Callable[[int], None], num_threads: 
         done += steps
         report(done)
 
-    return evaluate(condition, progress=advance, num_threads=num_threads)
+    try:
+        return [Outcome(evaluation) for evaluation in evaluate_together(conditions, advance, num_threads)]
+    except PolicyFailedError as error:
+        if len(conditions) == 1:
+            return [Outcome(error=error.with_traceback(None))]
+    return [outcome for condition in conditions for outcome in _evaluate([condition], lambda _: None, num_threads)]

@@ -1,6 +1,6 @@
 """Run a policy in an environment, many episodes at once; keep its metrics, one time series, and the static points."""
 
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -11,17 +11,20 @@ from gymnasium.vector import AutoresetMode
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
+from baselines.catalogue import Track
 from baselines.identification.static_points import HoldRecorder, StaticPoints
-from baselines.policies import is_saved
+from baselines.policies import is_saved, track
 from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.runtime.scenario import make_scenario
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.support_changes import SupportChanges
 from train.runs.failures import is_full
 from train.runs.user_code import named_object
 
-_MAX_WORLDS = 64
+MOST_WORLDS = 64
+"""Worlds that are played at once."""
 _BEFORE_FALL_S = 0.6
 """What happens in this time before a fall does not set the scale of a figure [s]."""
 
@@ -141,6 +144,49 @@ def make_vector_env(
     )
 
 
+def make_shared_env(
+    conditions: Sequence[Condition], num_threads: int = 0, autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP
+) -> Any:
+    """A vector environment with a world of each condition, whose scenarios may differ, see `in_common`.
+
+    Raises:
+        ConfigurationError: Unknown environment, scenario, reference or argument.
+    """
+    first, scenarios = conditions[0], [condition.scenario_played for condition in conditions]
+    if all(scenario == scenarios[0] for scenario in scenarios):
+        return make_vector_env(first, len(conditions), num_threads, autoreset_mode)
+    return gymnasium.make_vec(
+        first.environment.id,
+        num_envs=len(conditions),
+        vectorization_mode="vector_entry_point",
+        num_threads=num_threads,
+        autoreset_mode=autoreset_mode,
+        **{**first.arguments, "scenario": scenarios},
+    )
+
+
+def in_common(condition: Condition) -> str:
+    """What conditions must have in common for a vector environment in common.
+
+    That is everything but the scenario of a walker, of which a policy knows the friction and the rate of the IMU.
+    """
+    scenario = make_scenario(condition.scenario_played)
+    walks = condition.environment.walks
+    known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz) if walks else scenario
+    return repr((condition.env, {**condition.arguments, "scenario": known}))
+
+
+def plays_beside_others(condition: Condition) -> bool:
+    """Whether its policy does the same beside worlds of other scenarios.
+
+    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are of one.
+    """
+    name = condition.policy.name
+    if ":" in name and not is_saved(name):
+        return False
+    return track(name, condition.environment.walks) not in (Track.TRUTH, Track.WALKS)
+
+
 def with_one_world(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
     """Conditions, each with an environment of one world, which those that differ by their policy share."""
     made: dict[str, Any] = {}
@@ -160,7 +206,7 @@ def num_steps(conditions: Iterable[Condition]) -> list[int]:
 
 
 def _worlds_at_once(condition: Condition) -> int:
-    return 1 if condition.environment.is_real else _MAX_WORLDS
+    return 1 if condition.environment.is_real else MOST_WORLDS
 
 
 def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
@@ -174,37 +220,56 @@ def evaluate(condition: Condition, progress: Progress | None = None, num_threads
         progress: Called with the number of control steps done since the last call.
         num_threads: Threads of the physics, 0 for all cores.
     """
-    result = Evaluation(condition)
-    at_once = _worlds_at_once(condition)
-    for first in range(0, condition.episodes, at_once):
-        worlds = min(at_once, condition.episodes - first)
-        with closing(make_vector_env(condition, worlds, num_threads)) as env:
-            _play(env, condition, first, worlds, result, progress)
-    return result
+    return evaluate_together([condition], progress, num_threads)[0]
 
 
-def _play(
-    env: Any, condition: Condition, first: int, worlds: int, result: Evaluation, progress: Progress | None
-) -> None:
-    """One batch of worlds, each until the end of its first episode."""
+def evaluate_together(
+    conditions: Sequence[Condition], progress: Progress | None = None, num_threads: int = 0
+) -> list[Evaluation]:
+    """Play conditions of one policy side by side, which costs less; their results are those of `evaluate`.
+
+    Args:
+        conditions: What to play: one, or several with the same `in_common` that play beside others.
+        progress: See `evaluate`.
+        num_threads: See `evaluate`.
+    """
+    results = [Evaluation(condition) for condition in conditions]
+    episodes = [(result, number) for result in results for number in range(result.condition.episodes)]
+    at_once = _worlds_at_once(conditions[0])
+    for first in range(0, len(episodes), at_once):
+        batch = episodes[first : first + at_once]
+        with closing(make_shared_env([result.condition for result, _ in batch], num_threads)) as env:
+            _play(env, batch, progress)
+    return results
+
+
+def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progress | None) -> None:
+    """Episodes of conditions, by their numbers, a world each; in every world the first episode counts."""
+    condition, worlds = episodes[0][0].condition, len(episodes)
+    seeds = [result.condition.seed + number for result, number in episodes]
     policy = make_policy(condition.policy, env, condition.policy_options)
     if hasattr(policy, "rehearse"):
         with blamed(condition, 0):
-            policy.rehearse(env, condition.seed + first)
+            policy.rehearse(env, seeds[0])
     task = env.unwrapped.task
-    keeper = _FirstWorld(task, condition.environment.traced) if first == 0 else None
+    keepers = {
+        world: _FirstEpisode(task, condition.environment.traced, world)
+        for world, (_, number) in enumerate(episodes)
+        if number == 0
+    }
     is_scored = hasattr(policy, "link_estimate") and not condition.environment.is_real
     estimates = _Estimates(task, worlds) if is_scored else None
     imu = _ImuError(task, worlds) if isinstance(task.assumed_model, WalkerModel) else None
     parts = [part.metrics for part in (estimates, imu) if part is not None]
     if hasattr(task, "robot_record"):  # of the robots that a walker draws from ranges
         parts.append(task.robot_record)
-    observation, info = env.reset(seed=condition.seed + first)
+    observation, info = env.reset(seed=seeds)
     records: list[dict[str, Any] | None] = [None] * worlds
     state, episode_start, step, reported = None, np.ones(worlds, dtype=np.bool_), 0, 0
     while any(record is None for record in records):
-        if keeper is not None and records[0] is None:
-            keeper.take(observation, info)
+        for world, keeper in keepers.items():
+            if records[world] is None:
+                keeper.take(observation, info)
         if imu is not None:
             imu.take(observation, info)
         with blamed(condition, step):
@@ -213,21 +278,23 @@ def _play(
                 estimates.take(step, policy.link_estimate(observation, state), observation, env.unwrapped.truth())
             observation, _, terminated, truncated, info = env.step(action)
         episode_start = np.zeros(worlds, dtype=np.bool_)
-        for world in np.flatnonzero(terminated | truncated):
+        for world in np.flatnonzero(terminated | truncated).tolist():
             if records[world] is None:
-                own = [metrics(int(world)) for metrics in parts]
-                records[world] = _record(condition, first + int(world), info, int(world), own)
-                if world == 0 and keeper is not None:
-                    keeper.take(observation, info)
+                result, number = episodes[world]
+                records[world] = _record(result.condition, number, info, world, [metrics(world) for metrics in parts])
+                if world in keepers:
+                    keepers[world].take(observation, info)
         step += 1
         if progress is not None and step - reported == 250:
             progress(step - reported)
             reported = step
     if progress is not None:
         progress(task.num_steps - reported)
-    result.episodes.extend(record for record in records if record is not None)
-    if keeper is not None:
-        result.trace, result.points, result.rest_references = keeper.trace(), keeper.points(), keeper.references
+    for world, ((result, _), record) in enumerate(zip(episodes, records, strict=True)):
+        if record is not None:
+            result.episodes.append(record)
+        if keeper := keepers.get(world):
+            result.trace, result.points, result.rest_references = keeper.trace(), keeper.points(), keeper.references
 
 
 @contextmanager
@@ -326,11 +393,11 @@ class _Estimates:
         return {"link_estimate_error_rms_rad": self._rms.of(world), **changes}
 
 
-class _FirstWorld:
-    """Time series and static points of the first world."""
+class _FirstEpisode:
+    """Time series and static points of an episode, that of a world."""
 
-    def __init__(self, task: Any, traced: tuple[str, ...]) -> None:
-        self._traced = traced
+    def __init__(self, task: Any, traced: tuple[str, ...], world: int) -> None:
+        self._traced, self._world = traced, world
         self._encoder = task.observation_table.group("encoder_angle")
         visits = getattr(getattr(task.config, "reference", None), "visits", None)
         is_seen = "link_angle_imu" in traced  # static points need the IMU of the only link
@@ -339,10 +406,11 @@ class _FirstWorld:
         self._rows: list[tuple[float, ...]] = []
 
     def take(self, observation: Array, info: dict[str, Any]) -> None:
-        self._rows.append(tuple(float(info[name][0]) for name in self._traced))
+        own = slice(self._world, self._world + 1)
+        self._rows.append(tuple(float(info[name][self._world]) for name in self._traced))
         if self._recorder is not None:
-            encoder = observation[:1, self._encoder][:, 0]
-            self._recorder.take(encoder, info["link_angle_imu"][:1], int(info["rest"][0]))
+            encoder = observation[own, self._encoder][:, 0]
+            self._recorder.take(encoder, info["link_angle_imu"][own], int(info["rest"][self._world]))
 
     def trace(self) -> dict[str, Array]:
         return dict(zip(self._traced, np.array(self._rows).T, strict=True))

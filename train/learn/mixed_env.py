@@ -1,8 +1,9 @@
-"""Several vector environments as one: worlds of different scenarios under one policy."""
+"""Several vector environments as one: worlds of scenarios that cannot share one, under one policy."""
 
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
 from typing import Any
 
 import gymnasium
@@ -17,7 +18,7 @@ from elastic_env.runtime.envs import reset_mask
 from elastic_env.runtime.robot_model import RobotModel
 from elastic_env.runtime.task import Task
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import make_vector_env
+from train.evaluate.evaluate import in_common, make_shared_env
 
 
 class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -32,11 +33,11 @@ class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
     Args:
         envs: Vector environments of ours with `autoreset_mode=DISABLED`, of the same task in different scenarios.
         num_threads: Environments that step at a time, 0 for as many as there are cores.
-        weights: Factor of each environment's rewards; None for equal ones.
+        weights: Factor of every world's rewards; None for equal ones.
 
     Raises:
         ConfigurationError: None, different observations, tasks, motions or assumed joints, another autoreset mode, or
-            not one weight per environment.
+            not one weight per world.
     """
 
     STATE = ("envs",)
@@ -63,15 +64,14 @@ class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
                     "all environments of a mixture must let a policy assume the same joints: give them the same "
                     'stiffness, and keep scenarios with "ideal", where no friction is assumed, apart from the others'
                 )
-        factors = [1.0] * len(envs) if weights is None else list(weights)
-        if len(factors) != len(envs):
-            raise ConfigurationError(f"weights must be one per environment, {len(envs)}, got {factors}")
         self._threads = ThreadPoolExecutor(min(_cores(num_threads), len(envs)))
         sizes = [env.num_envs for env in envs]
         ends = np.cumsum(sizes).tolist()
         self._worlds = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        self._weights = np.repeat(factors, sizes)
         self.num_envs = ends[-1]
+        self._weights = np.ones(self.num_envs) if weights is None else np.array(weights)
+        if self._weights.shape != (self.num_envs,):
+            raise ConfigurationError(f"weights must be one per world, {self.num_envs}, got {len(self._weights)}")
         self.autoreset_mode = AutoresetMode.DISABLED
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.single_observation_space = envs[0].single_observation_space
@@ -142,7 +142,7 @@ class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
 def mixed_env(
     conditions: Sequence[Condition], sizes: Sequence[int], num_threads: int = 0, weights: Sequence[float] | None = None
 ) -> MixedVectorEnv:
-    """Worlds of several conditions.
+    """Worlds of several conditions; neighbours that can have an environment in common have one.
 
     Args:
         conditions: Cells of one environment and motion; their policies are not used.
@@ -153,12 +153,13 @@ def mixed_env(
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    threads = threads_of_each(_cores(num_threads), len(conditions))
+    shares = [list(share) for _, share in groupby(zip(conditions, sizes, strict=True), lambda own: in_common(own[0]))]
+    threads = threads_of_each(_cores(num_threads), len(shares))
     envs = [
-        make_vector_env(condition, size, own, AutoresetMode.DISABLED)
-        for condition, size, own in zip(conditions, sizes, threads, strict=True)
+        make_shared_env([condition for condition, size in share for _ in range(size)], own, AutoresetMode.DISABLED)
+        for share, own in zip(shares, threads, strict=True)
     ]
-    return MixedVectorEnv(envs, num_threads, weights)
+    return MixedVectorEnv(envs, num_threads, None if weights is None else np.repeat(weights, sizes).tolist())
 
 
 def _cores(num_threads: int) -> int:
