@@ -86,7 +86,7 @@ class _Playing:
         self._conditions, self._console, self._place, self._store = conditions, console, place, store
         steps = num_steps(conditions)
         cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
-        batches = [(batch, max(steps[number] for number in batch)) for batch in in_batches(conditions, cores)]
+        batches = [(batch, sum(steps[number] for number in batch)) for batch in in_batches(conditions, cores)]
         longest_first = sorted(batches, key=lambda batch: -batch[1])
         self._batches, self._steps = [batch for batch, _ in longest_first], [steps for _, steps in longest_first]
         self._keys = [] if store is None else [cell_key(condition) for condition in conditions]

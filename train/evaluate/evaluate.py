@@ -198,11 +198,8 @@ def with_one_world(conditions: Iterable[Condition]) -> Iterator[tuple[Condition,
 
 
 def num_steps(conditions: Iterable[Condition]) -> list[int]:
-    """Control steps that all episodes of each condition take, for progress bars."""
-    return [
-        -(-condition.episodes // _worlds_at_once(condition)) * env.unwrapped.task.num_steps
-        for condition, env in with_one_world(conditions)
-    ]
+    """Control steps that all episodes of each condition take together, for progress bars."""
+    return [condition.episodes * env.unwrapped.task.num_steps for condition, env in with_one_world(conditions)]
 
 
 def _worlds_at_once(condition: Condition) -> int:
@@ -217,7 +214,7 @@ def evaluate(condition: Condition, progress: Progress | None = None, num_threads
 
     Args:
         condition: What to play.
-        progress: Called with the number of control steps done since the last call.
+        progress: Called with the number of control steps done since the last call, of all episodes together.
         num_threads: Threads of the physics, 0 for all cores.
     """
     return evaluate_together([condition], progress, num_threads)[0]
@@ -286,10 +283,10 @@ def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progre
                     keepers[world].take(observation, info)
         step += 1
         if progress is not None and step - reported == 250:
-            progress(step - reported)
+            progress(worlds * (step - reported))
             reported = step
     if progress is not None:
-        progress(task.num_steps - reported)
+        progress(worlds * (task.num_steps - reported))
     for world, ((result, _), record) in enumerate(zip(episodes, records, strict=True)):
         if record is not None:
             result.episodes.append(record)

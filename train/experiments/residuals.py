@@ -24,6 +24,7 @@ from train.workers.places import Place
 
 RESIDUALS = {
     "testbed": "learned_testbed",
+    "testbed_friction": "learned_testbed_friction",
     "robot": "learned_robot",
     "walker_3s": "learned_walker",
     "walker_3s_posture": "learned_posture",

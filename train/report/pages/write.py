@@ -54,6 +54,7 @@ TABLES = {
             "learned_posture_1100ms",
             "learned_robot",
             "learned_testbed",
+            "learned_testbed_friction",
             "learned_walker",
         )
     },
@@ -184,6 +185,7 @@ PARTS: Mapping[str, Part] = {
     "learned posture at 1.6 s": _of(changes_table, "learned_posture_1600ms"),
     "learned posture at 1.1 s": _of(changes_table, "learned_posture_1100ms"),
     "learned on the testbed": _of(changes_table, "learned_testbed"),
+    "learned on friction of the testbed": _of(changes_table, "learned_testbed_friction"),
     "learned on an arm": _of(partial(changes_table, metrics=ARM), "learned_robot"),
     "learned on the walker": _of(changes_table, "learned_walker"),
     "speed of vector environments": _of(speeds.vector_environments, "speed_walker", "speed_testbed"),
