@@ -11,6 +11,7 @@ from typing import Any
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _NUMBERS = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?( [-+]?(nan|[\d.]+(e[-+]?\d+)?))*")
 """Numbers side by side, which are no formula whatever their sign."""
+_SPACE = re.compile(r"[^\S\N{NO-BREAK SPACE}]+")
 _IN_SCRIPT = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
 
 
@@ -39,8 +40,8 @@ def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
 
 
 def markdown_text(text: str) -> str:
-    """Plain text in Markdown, in one line, also within a table."""
-    return html.escape(" ".join(text.split()), quote=False).replace("|", "\\|")
+    """Plain text in Markdown, in one line, also within a table; no-break spaces stay."""
+    return html.escape(_SPACE.sub(" ", text).strip(), quote=False).replace("|", "\\|")
 
 
 def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

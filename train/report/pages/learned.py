@@ -170,8 +170,14 @@ def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
     base = 1e3 * float(row["base_mean"])
     return (
         f"{base:.{2 if unit == 'mrad' and base < _SMALL else 1}f}",
-        f"{percent_interval(Estimate(change, low, high))}{star}",
+        f"{_unbroken(percent_interval(Estimate(change, low, high)))}{star}",
     )
+
+
+def _unbroken(interval: str) -> str:
+    """A change whose interval stays on one line in a narrow table."""
+    change, _, ends = interval.partition(" [")
+    return "{} [{}".format(*(part.replace(" ", "\N{NO-BREAK SPACE}") for part in (change, ends)))
 
 
 def _change(row: Mapping[str, str]) -> str:
