@@ -3,6 +3,7 @@
 =====================================================
 
 A policy is an object with ``predict``. This one commands a share of what ``input_output`` commands.
+Observations are ``(num_worlds, m)``: take columns as ``observation[..., k]``.
 """
 
 # %%
@@ -71,4 +72,7 @@ print((folder / "board" / "leaderboard.md").read_text())
 
 # %%
 # Less than the whole offset is worse in ``nominal`` and in ``soft``. Is a share above one better in ``soft``? Try it.
-# The page on the leaderboard says how to submit a policy.
+#
+# To compensate more or less of the deflection alone, assume another stiffness:
+# ``baselines.make("input_output", env, stiffness_scale=0.8)``. The page on commands has a policy with memory, and the
+# paper's compensator around a policy of your own. The page on the leaderboard says how to submit a policy.

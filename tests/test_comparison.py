@@ -517,8 +517,15 @@ def test_report_begins_with_three_sentences() -> None:
     ]
     assert re.findall(r"<p>(.*?)</p>", report_of(cells))[0] == (
         "2 policies played 8 episodes in 2 scenarios, of which 2 failed. "
-        "The lowest pelvis error rms is that of base, a mean of 3000.00 mrad. better comes last, with 1000.00 mrad."
+        "The lowest pelvis error rms is that of base, a mean of 3000.00 mrad; it is ahead in 2 of 2 cells. "
+        "better comes last, with 1000.00 mrad."
     )
+    apart = [
+        cell(policy, {"all": [value, value]}, scenario)
+        for policy, values in (("base", (2.0, 9.0)), ("tuned to soft", (8.0, 1.0)))
+        for scenario, value in zip(("ideal", "soft"), values, strict=True)
+    ]
+    assert "is that of tuned to soft, a mean of 4500.00 mrad; it is ahead in 1 of 2 cells." in report_of(apart)
     few = [
         e
         for s in ("soft", "ideal")

@@ -25,7 +25,8 @@ class Compensated(PolicyWithInputs):
     Args:
         policy: Anything with `predict`; its state may be anything. One that does not read joint rates can say so by an
             attribute `reads_rates = False`, which saves their estimate.
-        compensator: Where the motor has to lead, and where the link is.
+        compensator: Where the motor has to lead, and where the link is: an object with the attributes and methods of
+            `baselines.compensation.compensators.Compensator`.
         ramp_s: Duration of the ramp.
         corrects_policy: Whether the input `deflection` also reaches the policy, as one that winds springs needs it.
     """

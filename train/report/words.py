@@ -129,8 +129,19 @@ def _ends(results: Results) -> tuple[str, str]:
     others = [title for title in scores if title != best and np.isfinite(scores[title][0].value)]
     worst = max(others or [best], key=lambda title: (scores[title][1][0] / scores[title][1][1], scores[title][0].value))
     shown = {t: f"{column.scale * scores[t][0].value:.{column.decimals}f} {column.unit}" for t in (best, worst)}
-    found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}."
-    return found, f"{worst} comes last, with {shown[worst]}." if others else "No other policy was played."
+    found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}"
+    ahead = _cells_ahead(results.evaluations, best, column)
+    where = f"; it is ahead in {sum(ahead)} of {len(ahead)} cells" if len(ahead) > 1 and others else ""
+    return f"{found}{where}.", f"{worst} comes last, with {shown[worst]}." if others else "No other policy was played."
+
+
+def _cells_ahead(evaluations: Sequence[Evaluation], policy: str, column: Column) -> list[bool]:
+    """Whether a policy is the best by a metric, for every cell of motion, scenario and swept value."""
+    ahead = []
+    for cell in grouped(evaluations, lambda e: e.condition.cell).values():
+        played = grouped(cell, lambda e: e.condition.policy.title)
+        ahead.append(best_of({t: (_mean_of_cells(own, column), failed_of(own)) for t, own in played.items()}) == policy)
+    return ahead
 
 
 def _mean_of_cells(evaluations: Sequence[Evaluation], column: Column) -> Estimate:
