@@ -48,15 +48,6 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
 
 
-def with_rival(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
-    """Training seeds that are also compared with `best`."""
-    found = []
-    for e in evaluations:
-        assert e.condition.member is not None
-        found.append(Evaluation(e.condition.replace(member=e.condition.member.replace(rival="best")), e.episodes))
-    return found
-
-
 SOFT, IDEAL = [[4.0, 6.0], [3.0, 5.0], [8.0, 8.0], [1.0, 1.0], [2.0, 2.0]], [[1.0, 1.0]] * 5
 
 
@@ -67,7 +58,7 @@ def played() -> list[Evaluation]:
         cell("base", {"all": [2.0]}, "slope"),
         cell("best", {"all": [4.0, None]}, "soft"), cell("best", {"all": [1.0]}, "ideal"),
         cell("best", {"all": [1.0]}, "slope"),
-        *with_rival([*family(SOFT, "soft"), *family(IDEAL, "ideal"), *family([[5.0]] * 5, "slope")]),
+        *family(SOFT, "soft"), *family(IDEAL, "ideal"), *family([[5.0]] * 5, "slope"),
     ]  # fmt: skip
     sensor = [cell("sensor", {"all": [n]}, s) for n, s in ((7.0, "soft"), (2.0, "ideal"), (1.0, "slope"))]
     named = PolicySpec(name="mine.py:make", label="sensor", track=Track.TORQUE_SENSORS)
@@ -111,18 +102,25 @@ def test_a_score_is_a_mean_of_scenarios_and_of_training_seeds() -> None:
     assert (row("learned", "both").training_seeds, row("base", "both").training_seeds) == (5, 0)
 
 
-def test_changes_of_a_residual_are_those_of_the_statistics() -> None:
-    """Catches base and rival swapped, and changes of another scope or motion."""
+def test_changes_to_the_base_are_those_of_the_statistics() -> None:
+    """Catches changes of another scope or motion."""
     found = played()
     for scope in ("both", "soft"):
-        pairs = [c for c in changes(found, GROUPS)
-                 if (c.policy, c.scope, c.reference, c.column.metric) == ("learned", scope, "3 s", METRIC)]  # fmt: skip
-        base, rival = row("learned", scope).base, row("learned", scope).rival
-        assert base is not None
-        assert rival is not None
-        assert (base.to, rival.to) == ("base", "best")
-        assert [base.change, rival.change] == [c.relative for c in pairs]
-    assert row("base", "both").base is None
+        name = ("learned", scope, "3 s", METRIC)
+        (own,) = [c for c in changes(found, GROUPS) if (c.policy, c.scope, c.reference, c.column.metric) == name]
+        assert row("learned", scope).base == Paired("base", own.relative, own.verdict)
+    assert (row("base", "both").base, row("base", "both").rival) == (None, None)
+
+
+def test_a_residual_is_compared_with_the_best_of_each_column() -> None:
+    """Catches one rival for all columns, one that falls, one with further sensors, and changes of single scenarios."""
+    rivals = {scope: row("learned", scope).rival for scope in ("soft", "both", "ideal", "slope")}
+    assert {scope: rival and rival.to for scope, rival in rivals.items()} == {
+        "soft": "base", "both": "base", "ideal": "best", "slope": "best",  # best falls in soft
+    }  # fmt: skip
+    assert change_to(rivals["slope"]).value == pytest.approx(4.0)
+    assert change_to(rivals["ideal"]).value == pytest.approx(0.0)
+    assert rivals["both"] == row("learned", "both").base
 
 
 def test_columns_are_whole_groups_and_what_is_in_none() -> None:
@@ -203,10 +201,13 @@ def test_all_forms_have_the_same_figures() -> None:
     assert "<b>6000</b> / <b>6000</b></td>" in page
     assert '2500 / 2500 <span class="falls">✕1/3</span>' in page
     head, lines = paired_rows(rows())
-    assert head[-1] == "against the best policy without learning"
-    assert lines[0][:3] == ["learned", "both, 3 s", "pelvis error rms"]
-    assert lines[0][3].endswith("(base)")
-    assert lines[0][4].endswith("(best)")
+    assert head[2:4] == [
+        f"pelvis error rms, against {other}" for other in ("its base", "the best policy without learning")
+    ]
+    assert [line[:2] for line in lines] == [["learned", "both, 3 s"], ["learned", "all, 3 s"]]
+    assert (lines[0][2].endswith("(base)"), lines[0][3]) == (True, "the same")
+    single = [replace(s, is_column=True) for s in rows() if s.scope == "slope"]
+    assert paired_rows(single)[1][0][3].endswith("(best)")
 
 
 # The configuration.

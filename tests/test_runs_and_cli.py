@@ -26,6 +26,7 @@ import train.experiments.demo
 import train.report.summary
 import train.speed.contenders
 import train.speed.speed
+from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.identification.identify import Identification
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, ResultsExistError
@@ -551,6 +552,7 @@ def test_text_that_is_no_yaml_names_its_file(capsys: pytest.CaptureFixture[str])
         (["evaluate", "--help"], ["--policy", "dynamic", "--scenario", "nominal", "--episodes", "Example"]),
         (["evaluate", "--help"], ["walker", "input_wrench", "step_period", "num_steps", "push"]),
         (["evaluate", "--help"], ["a list of one per joint", "twelve on the walker", "identification.json"]),
+        (["evaluate", "--help"], [*ON_JOINTS, *ON_THE_WALKER]),
         (["play", "--help"], ["walker", "--reference", ".mp4"]),
         (["speed", "--help"], ["walker", "--policy", "--num-envs"]),
         (["compare", "--help"], ["configs/", "episodes.csv", "report.html", "residual:PATH", "--jobs"]),

@@ -91,9 +91,14 @@ class Evaluate:
     """
 
     policy: str = "input"
-    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own. Baselines are
-    zero, uncompensated, input, dynamic, oracle; on the walker also
-    uncompensated_open, input_open, input_output, input_wrench."""
+    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own.
+    Baselines (see Policies in the docs) are
+    zero, uncompensated, input, dynamic, link_encoder,
+    iterative, oracle; on a fixed base also friction,
+    disturbance_observer; on the walker also
+    uncompensated_open, input_open, input_output,
+    input_wrench, adaptive, posture, adaptive_posture,
+    torque_sensor, hip_sensor, thormang, talos."""
     env: str = "testbed"
     """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in place),
     robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a JointRobot."""

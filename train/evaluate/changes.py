@@ -32,6 +32,8 @@ _LEAST = 0.005
 """Below it a bound would look like zero without one."""
 
 Groups = Mapping[str, Sequence[str]]
+Cells = Sequence[tuple[Sequence[Evaluation], Sequence[Evaluation]]]
+"""Evaluations of a policy, one per training seed, and those of whom it is compared with; of one cell or of several."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,8 +264,7 @@ def _against(own: Sequence[Evaluation], base: Sequence[Evaluation], trained: Ori
     return rows
 
 
-def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]], trained: Origin | None, is_group: bool
-          ) -> list[Change]:  # fmt: skip
+def _rows(scope: str, cells: Cells, trained: Origin | None, is_group: bool) -> list[Change]:
     """A row per judged column, over one scenario or several."""
     first = cells[0][0][0].condition
     known = first.environment
@@ -272,13 +273,12 @@ def _rows(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]]
     return [_row(scope, cells, column, marks, is_group) for column in (*known.judged, *known.also)]
 
 
-def paired(own: list[Evaluation], base: list[Evaluation], column: Column) -> Change:
-    """A policy against another one in one cell and metric; without marks."""
-    return _row(own[0].condition.scenario, [(own, base)], column, (), is_group=False)
+def paired(cells: Cells, column: Column) -> Change:
+    """A policy against another one in one metric, in one cell or pooled over several; without marks."""
+    return _row(cells[0][0][0].condition.scenario, cells, column, (), is_group=len(cells) > 1)
 
 
-def _row(scope: str, cells: Sequence[tuple[list[Evaluation], list[Evaluation]]], column: Column,
-         marks: tuple[str, ...], is_group: bool) -> Change:  # fmt: skip
+def _row(scope: str, cells: Cells, column: Column, marks: tuple[str, ...], is_group: bool) -> Change:
     """The change of one metric, over one scenario or several."""
     first, base = cells[0][0][0].condition, cells[0][1][0].condition
     mine = [e for ours, _ in cells for e in ours]

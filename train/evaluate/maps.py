@@ -232,7 +232,7 @@ def _cell(evaluations: Sequence[Evaluation], column: Column) -> MapCell:
     tracks = {title: own[0].condition.track for title, own in policies.items()}
     analytic = best_of({title: scored for title, scored in scores.items() if tracks[title] is Track.STANDARD})
     learned = {} if analytic is None else {
-        title: paired(own, policies[analytic], column)
+        title: paired([(own, policies[analytic])], column)
         for title, own in policies.items() if own[0].condition.member is not None
     }  # fmt: skip
     return MapCell(

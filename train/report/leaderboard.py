@@ -11,6 +11,7 @@ from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import BEST_ANALYTIC, percent_interval
 from train.evaluate.environments import Column
+from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
@@ -164,11 +165,23 @@ def _column(standing: Standing) -> Column:
 
 def paired_rows(found: Sequence[Standing]) -> tuple[list[str], list[list[str]]]:
     """What learning adds: head and rows of the residuals' paired changes in every column; no rows without residuals."""
-    rows = []
-    for s in found:
-        if s.is_column and s.training_seeds:
-            rows.append([s.policy, f"{s.scope}, {s.reference}", s.title, said(s.base), said(s.rival or s.base)])
-    return ["residual", "where", "metric", "against its base", f"against the {BEST_ANALYTIC}"], rows
+    learned = [s for s in found if s.is_column and s.training_seeds]
+    titles = dict.fromkeys(s.title for s in learned)
+    rows = [
+        [
+            policy,
+            f"{scope}, {reference}",
+            *(text for s in own for text in (said(s.base), _said_beside(s.rival, s.base))),
+        ]
+        for (policy, scope, reference), own in grouped(learned, lambda s: (s.policy, s.scope, s.reference)).items()
+    ]
+    changes = (f"{title}, against {other}" for title in titles for other in ("its base", f"the {BEST_ANALYTIC}"))
+    return ["residual", "where", *changes], rows
+
+
+def _said_beside(rival: Paired | None, base: Paired | None) -> str:
+    """A change against a rival, once where that is the base."""
+    return "the same" if rival is not None and base is not None and rival.to == base.to else said(rival)
 
 
 def said(paired: Paired | None) -> str:
@@ -193,7 +206,8 @@ LEGEND = (
 )
 PAIRED = (
     "Paired changes on the same episodes: interquartile mean over training seeds with its 95 % interval. Below zero, "
-    "learning is ahead. A star: not told from chance, or too few training seeds."
+    "learning is ahead. A star: not told from chance, or too few training seeds. The best policy without learning is "
+    "the best of the first track in that column and metric, on the same episodes, which favours it."
 )
 
 
@@ -219,7 +233,7 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
 def claims_markdown(found: Sequence[Standing]) -> str:
     """What learning adds, as a table."""
     head, rows = paired_rows(found)
-    return "\n\n".join([PAIRED, markdown_table(head, ["---"] * 3 + ["---:"] * 2, rows)]) + "\n"
+    return "\n\n".join([PAIRED, markdown_table(head, ["---"] * 2 + ["---:"] * (len(head) - 2), rows)]) + "\n"
 
 
 def _board_markdown(shown: Board) -> str:
