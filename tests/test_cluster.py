@@ -188,6 +188,19 @@ def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
         Place(on)
 
 
+@pytest.mark.parametrize(
+    ("place", "calls", "threads"),
+    [(Place(), 1, 8), (Place(), 3, 2), (Place(), 20, 1), (Place(jobs=2), 20, 4), (Place(jobs=12), 20, 1),
+     (Place("dask://host:1"), 1, 1)],
+)  # fmt: skip
+def test_calls_share_the_cores_of_this_machine(
+    place: Place, calls: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches cores that stand idle beside one training seed, and more threads than cores."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert place.threads_of_each(calls) == threads
+
+
 def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("train.workers.dask_cluster._CONNECT_S", 0.5)
     port = free_port()

@@ -274,6 +274,8 @@ def compare(
         if maps:
             files.append(write_maps(maps, folder / "map.csv"))
         rows = changes(evaluations, config.groups) if report else []
+        if config.leaderboard or maps:  # which find the best policy of every column or cell themselves
+            rows = [row for row in rows if not row.is_rival]
         board = []
         if config.leaderboard:
             console.print("measuring the time of every policy, in turn")

@@ -137,7 +137,7 @@ class _Call:
 
 
 def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: Show) -> None:
-    """Train seeds beside each other, with one thread each: they share the cores among them.
+    """Train seeds beside each other: they share the cores among them.
 
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
     """
@@ -154,7 +154,8 @@ def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: 
     def moved(number: int) -> None:
         console.print(f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True)
 
-    given = [(call.run.config, call.seed, call.run.folder.resolve(), 1) for call in calls]
+    threads = place.threads_of_each(len(calls))
+    given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
     watch = Watch(reported=report, tallied=tallied, moved=moved)
     with place.opened(len(given), calls[0].run.folder) as pool:
         outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)

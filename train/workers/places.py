@@ -1,5 +1,6 @@
 """Where calls run, as `--on` names it."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -45,6 +46,13 @@ class Place:
     def is_local(self) -> bool:
         """Whether it is this machine."""
         return self.on == LOCAL
+
+    def threads_of_each(self, calls: int) -> int:
+        """Threads of each of some calls: an equal share of the cores of this machine; elsewhere one."""
+        if not self.is_local:
+            return 1
+        cores = os.cpu_count() or 1
+        return max(1, cores // min(self.jobs or cores, calls))
 
     @contextmanager
     def opened(self, calls: int, folder: Path) -> Iterator[Pool]:
