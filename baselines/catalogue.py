@@ -110,8 +110,15 @@ def _base(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _weighing(build: Builder) -> Builder:
-    """With a controller that measures the robot's weight, unless its gains are given."""
-    return lambda env, model, options: build(env, model, options if options.gains else options.replace(gains=_WEIGHING))
+    """With a controller that measures the robot's weight, unless the gains say otherwise."""
+
+    def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
+        gains = options.gains or WalkingGains()
+        if "weight_filter_s" not in gains.model_fields_set:
+            gains = gains.replace(weight_filter_s=_WEIGHT_FILTER_S)
+        return build(env, model, options.replace(gains=gains))
+
+    return built
 
 
 def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -185,7 +192,7 @@ def _talos(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
     return HipTorque(_controller(env, model, options), model, options.hip_torque)
 
 
-_WEIGHING = WalkingGains(weight_filter_s=1.0)
+_WEIGHT_FILTER_S = 1.0
 
 COMPENSATED: Mapping[str, Builder] = {
     "input": _around(_controller, GravityCompensator, "none"),

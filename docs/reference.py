@@ -1,4 +1,4 @@
-"""The reference pages that are written from the code: environments, commands, and the equations' functions."""
+"""The reference pages that are written from the code: environments, gains of policies, and the help of commands."""
 
 import contextlib
 import io
@@ -9,8 +9,11 @@ from pathlib import Path
 from typing import get_args
 
 import gymnasium
+from pydantic.fields import FieldInfo
 
+from baselines.options import PolicyOptions
 from elastic_env import IDS
+from elastic_env.core.config import Model
 from elastic_env.core.signals import Signal
 from elastic_env.runtime.scenario import scenario_names
 from train.commands.cli import Command, main
@@ -82,10 +85,51 @@ def commands_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def gains_page() -> str:
+    """Every option of a policy that is a mapping of gains: names, defaults, bounds and meaning."""
+    intro = "Written from the declarations in the code. [Options](../options.md#policies) says which policy has which."
+    parts = ["# Gains of policies", intro]
+    for option, field in PolicyOptions.model_fields.items():
+        models = [kind for kind in (field.annotation, *get_args(field.annotation)) if _is_model(kind)]
+        for model in models:
+            about = (model.__doc__ or "").partition("\n")[0]
+            rows = [_parameter(name, parameter) for name, parameter in model.model_fields.items()]
+            parts += [f"## `{option}`", about, table(["name", "default", "bounds", "meaning"], rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _is_model(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Model)
+
+
+def _parameter(name: str, field: FieldInfo) -> list[str]:
+    """Name, default, bounds and meaning of a parameter."""
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    found = [(sign, getattr(bound, key, None)) for bound in field.metadata for key, sign in signs.items()]
+    bounds = ", ".join(f"{sign} {value:g}" for sign, value in found if value is not None)
+    return [f"`{name}`", _value(field.default), bounds, " ".join((field.description or "").split())]
+
+
+def _value(value: object) -> str:
+    """A default as a configuration writes it."""
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:.4g}"
+        case Model():
+            return f"{{{', '.join(f'{name}: {_value(getattr(value, name))}' for name in type(value).model_fields)}}}"
+        case _:
+            return str(value)
+
+
 def write_reference(folder: Path) -> None:
     """Write the generated pages; a page that has not changed is left alone."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (("environments.md", environments_page()), ("help.md", commands_page())):
+    pages = {"environments.md": environments_page(), "gains.md": gains_page(), "help.md": commands_page()}
+    for name, text in pages.items():
         page = folder / name
         if not page.is_file() or page.read_text(encoding="utf-8") != text:
             page.write_text(text, encoding="utf-8")

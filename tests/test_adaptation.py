@@ -193,3 +193,19 @@ def test_a_controller_that_weighs_the_robot_finds_its_load() -> None:
         weights.append(state[0][0, -1] - env.unwrapped.assumed_model.biped.weight)
     assert weights[0] == pytest.approx(5.0 * 9.81, abs=2.0)
     assert weights[1] == 0.0
+
+
+def test_other_gains_leave_the_weight_measured() -> None:
+    """Catches a gain of the feedback that turns off the measurement of the weight, unseen."""
+    env = gymnasium.make("elastic_env/WalkInPlace-v0", scenario="ideal+payload")
+    last = []
+    for gains in (None, {"dcm": 0.4}, {"weight_filter_s": 1.0}, {"weight_filter_s": None}):
+        policy, state = baselines.make("adaptive_posture", env, gains=gains), None
+        observation, _ = env.reset(seed=0)
+        for _ in range(300):
+            action, state = policy.predict(observation, state)
+            observation, *_ = env.step(action)
+        last.append(action)
+    np.testing.assert_array_equal(last[1], last[0])
+    np.testing.assert_array_equal(last[2], last[0])
+    assert not np.array_equal(last[3], last[0])

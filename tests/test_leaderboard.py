@@ -4,6 +4,7 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from train.report.leaderboard import (
     board,
     leaderboard_markdown,
     paired_rows,
+    print_leaderboard,
     read_leaderboard,
     scenarios_board,
     three_digits,
@@ -208,6 +210,19 @@ def test_all_forms_have_the_same_figures() -> None:
     assert (lines[0][2].endswith("(base)"), lines[0][3]) == (True, "the same")
     single = [replace(s, is_column=True) for s in rows() if s.scope == "slope"]
     assert paired_rows(single)[1][0][3].endswith("(best)")
+
+
+def test_the_terminal_has_the_columns_that_it_has_room_for() -> None:
+    """Catches figures broken over lines, a column that is lost in silence, and a best that is not marked."""
+    for width, is_whole in ((100, True), (60, False)):
+        console = Console(width=width, record=True, file=StringIO())
+        print_leaderboard(rows(), console)
+        text = console.export_text(clear=False)
+        assert "6000 / 6000" in text
+        assert ("✕1/3" in text) == is_whole
+        assert ("no room for" not in text) == is_whole
+        assert ("soft, 1.6 s" in text) != is_whole
+        assert "\x1b[1m6000\x1b[0m / \x1b[1m6000" in console.export_text(styles=True)
 
 
 # The configuration.

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 import subprocess
 from functools import partial
 from pathlib import Path
@@ -587,6 +588,10 @@ def test_a_folder_that_is_no_residual_says_what_is_needed(tmp_path: Path) -> Non
     with pytest.raises(ConfigurationError, match=r"no residual at .*residual\.json"):
         baselines.make(f"residual:{tmp_path}", env)
     path = folder(tmp_path / "r")
+    (best, last), name = [folder(tmp_path / "seed" / name) for name in ("best", "last")], "seed"
+    with pytest.raises(ConfigurationError, match=rf"give one of them: {last}, {best}$"):  # the best one flatters itself
+        baselines.make(f"residual:{tmp_path / name}", env)
+    shutil.rmtree(tmp_path / name)
     with pytest.raises(ConfigurationError, match=rf"is no residual but has some inside; give one of them: {path}$"):
         baselines.make(f"residual:{tmp_path}", env)
     silent = json.dumps({"robot": "testbed"})

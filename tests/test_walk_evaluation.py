@@ -284,7 +284,7 @@ def test_tables_say_median_worst_and_falls() -> None:
 
 @pytest.mark.parametrize("width", [100, 72])
 def test_the_table_fits_its_terminal(width: int) -> None:
-    """Catches names cut short and numbers broken over lines; where there is no room, columns go and are named."""
+    """Catches names cut short, numbers broken over lines, and a lack of room that hides what policies are judged by."""
     cells = [
         made_up(walk(policy, [0.8, 0.6, 0.8], scenario="ideal+soft"), ("", 0.0876))
         for policy in ("uncompensated", "input_output")
@@ -297,6 +297,7 @@ def test_the_table_fits_its_terminal(width: int) -> None:
     row = next(line for line in lines if "uncompensated" in line).split()
     assert row[:4] == ["0.8+0.6+0.8", "s", "ideal+soft", "uncompensated"]
     assert set(row[4:-1]) <= {"87.60", "87.6", "88"}
+    assert any("ZMP" in line for line in lines if "no room" not in line)
     assert any("summary.md" in line for line in lines) == (width < 100)
     assert any("Eq. 1" in line for line in lines) == (width == 100)  # the legend is of what is shown
 

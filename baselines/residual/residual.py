@@ -202,8 +202,9 @@ def read_description(folder: Path) -> ResidualDescription:
 
 def _none_at(folder: Path, why: str) -> str:
     """What to do where no residual is, in a sentence."""
-    inside = sorted(path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}"))
+    inside = [path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")]
     if inside:
+        inside.sort(key=lambda path: (path.name != "last", path))  # the last policy, for the best one flatters itself
         return f"{folder} is no residual but has some inside; give one of them: {', '.join(map(str, inside))}"
     families = {name: [at.partition("/")[2] for at in own] for name, own in groupby(shipped(), _family)}
     names = ", ".join(f"{name}/{own[0]} to {own[-1]}" for name, own in families.items())

@@ -324,7 +324,7 @@ class View:
 
 @dataclass
 class Demo:
-    """The paper's experiments in short, on testbed and walker, in under two minutes, with pictures."""
+    """The paper's experiments in short, on testbed and walker, in some minutes, with pictures."""
 
     output: Path | None = None
     """Folder for the results, new or empty; default runs/demo, numbered if taken."""

@@ -15,16 +15,24 @@ from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column, Environment
 from train.evaluate.evaluate import Evaluation, grouped
 from train.evaluate.families import Origin, origin
-from train.evaluate.statistics import Estimate, change, improvement, over_seeds, pair
+from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, pair
 
-CEILING, HELD_OUT, SAME_ROBOT = "ceiling on the training condition", "held out", "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one that training never saw; one whose
-only robot is that of the training, so that evaluation differs by noise alone."""
+CEILING, SAME_ROBOT = "ceiling on the training condition", "trained robot"
+"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot is that of the
+training, so that evaluation differs by noise alone."""
+HELD_OUT, PARTLY = "held out", "partly held out"
+"""Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
 """What a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
 """Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
 misses the truth, over five every eleventh."""
+CLAIM_SEEDS = 10
+"""Training seeds that a claim needs; with fewer, intervals exclude zero too often without any effect."""
+
+SIGNS = {"none": "*", "unclear": "?"}
+"""Signs behind a change that is not shown, by its verdict."""
+SIGNS_ARE = "A star: the interval includes zero. A question mark: too few training seeds to say."
 
 _SMALL = 0.0995
 """Below it a share is shown with a decimal."""
@@ -53,7 +61,8 @@ class Change:
         per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
         relative: Interquartile mean of it over training seeds.
         improvement: Probability that an episode is better than the base's.
-        mine, theirs: Mean metric of the policy and of its base over the pairs [SI].
+        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile mean over training
+            seeds.
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
@@ -149,6 +158,11 @@ class Change:
         if self.num_compared == 1:
             return "one training seed: no interval"
         return f"{self.num_compared} training seeds: too few to tell it from chance"
+
+
+def signed_off(text: str, verdict: str) -> str:
+    """A change with the sign of its verdict behind it, if it has one."""
+    return f"{text} {SIGNS[verdict]}" if verdict in SIGNS else text
 
 
 def percent(value: float, signed: bool = True) -> str:
@@ -304,9 +318,9 @@ def _row(scope: str, cells: Cells, column: Column, marks: tuple[str, ...], is_gr
 
 
 def _mean(seeds: Sequence[Sequence[Array]]) -> float:
-    """Mean over training seeds, scenarios and episodes, in that order from outside; of those seeds that have all."""
+    """Interquartile mean, over the training seeds that have all, of means over scenarios and episodes."""
     means = [np.mean([values.mean() for values in some]) for some in seeds if all(len(values) for values in some)]
-    return float(np.mean(means)) if means else float("nan")
+    return float(interquartile_mean(np.array(means))) if means else float("nan")
 
 
 def _marks(
@@ -322,8 +336,10 @@ def _marks(
     unseen = [scenario for scenario in scenarios if scenario not in trained.scenarios]
     quantity = known.quantity or "reference"
     if unseen:
-        named = f": {', '.join(unseen)}" if len(unseen) < len(scenarios) else ""
-        return (f"{HELD_OUT}{named}" if seen else f"{HELD_OUT}{named or ' scenario'} and {quantity}",)
+        if len(unseen) == len(scenarios):
+            return (HELD_OUT if seen else f"{HELD_OUT} scenario and {quantity}",)
+        named = f": {', '.join(unseen)}"
+        return (f"{PARTLY}{named}" if seen else f"{HELD_OUT}{named} and {quantity}",)
     if not seen:
         return (f"{HELD_OUT} {quantity}",)
     if swept:

@@ -27,7 +27,7 @@ from train.figures import plots
 from train.figures.figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.changes_tables import print_changes, write_maps, write_statistics
-from train.report.leaderboard import write_leaderboard
+from train.report.leaderboard import print_leaderboard, write_leaderboard
 from train.report.robots_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import CONFIG, describe, locked, run_folder
@@ -287,6 +287,8 @@ def compare(
     print_summary(cells, console)
     print_robots(robots, console)
     print_changes(rows, console)
+    if board:
+        print_leaderboard(board, console)
     return Comparison(folder, evaluations, files)
 
 

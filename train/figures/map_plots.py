@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from train.evaluate.changes import BEST_ANALYTIC, Change, percent
+from train.evaluate.changes import BEST_ANALYTIC, SIGNS, Change, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
 from train.figures.plots import colours, require_matplotlib, save
@@ -117,15 +117,14 @@ def _best(cell: MapCell, column: Column, letters: Mapping[str, str], shades: Map
 
 
 def _learned(change: Change | None, letters: Mapping[str, str]) -> Square:
-    """A change, with a star where it is not told from chance; green below zero, red above."""
+    """A change, with a sign where it is not told from chance; green below zero, red above."""
     if change is None or not np.isfinite(change.relative.value):
         return Square("-", "", _EMPTY)
     value = change.relative.value
-    star = "" if change.verdict in ("lower", "higher") else "*"
     share = _STRONGEST * min(abs(value) / _STRONGEST_CHANGE, 1.0)
     small = f"to {letters[change.base]}" if change.base in letters else ""
     falls = f" ✕{change.falls}/{change.episodes}" if change.falls_more else ""
-    return Square(percent(value).removesuffix(" %") + star, f"{small}{falls}".strip(),
+    return Square(percent(value).removesuffix(" %") + SIGNS.get(change.verdict, ""), f"{small}{falls}".strip(),
                   blended(_AHEAD if value < 0.0 else _BEHIND, share))  # fmt: skip
 
 

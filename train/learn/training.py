@@ -8,6 +8,7 @@ and resumed ends with the same weights, bit for bit, as one that was not.
 import io
 import random
 import threading
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -69,7 +70,9 @@ class Training(Trainer):
         set_random_seed(seed)
         self._normaliser.seed(FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed)
         algorithm = algorithm_class(config.algorithm)
-        with options_named(config.algorithm, config.algorithm_options):
+        with options_named(config.algorithm, config.algorithm_options), warnings.catch_warnings():
+            # a rollout whose last minibatch is smaller is no mistake
+            warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
             self.model: Any = algorithm("MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options))
             self._learning_rate = float(self.model.lr_schedule(1.0))
             self._shrink_last_layer()

@@ -9,7 +9,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from train.evaluate.changes import BEST_ANALYTIC, CEILING, HELD_OUT, SAME_ROBOT, Change, by_line, percent_interval
+from train.evaluate.changes import (
+    BEST_ANALYTIC,
+    CEILING,
+    HELD_OUT,
+    PARTLY,
+    SAME_ROBOT,
+    SIGNS_ARE,
+    Change,
+    by_line,
+    percent_interval,
+    signed_off,
+)  # fmt: skip
 from train.evaluate.maps import HeatMap
 from train.runs.escaping import write_csv
 
@@ -91,11 +102,13 @@ def changes_table(rows: Sequence[Change]) -> Table:
     whose = "" if named else f"{escape(policies[0])}: "
     table = Table(
         title=f"{whose}change against {_opponent(rows)} on the same episodes, {over}",
-        caption=", ".join([*signs, "* an interval that includes zero, or too few training seeds: no difference shown"]),
+        caption=". ".join([*signs, SIGNS_ARE]),
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
     )  # fmt: skip
+    words = {"residual": policies, "scenario": [row.scope + _signs(row) for row in rows]}
     for name in (*named, "reference", "scenario", *swept):
-        table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold")
+        longest = max((len(word) for text in words.get(name, []) for word in text.split()), default=0)
+        table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold", min_width=min(longest, _MOST))
     for column in columns:
         table.add_column(column.title, justify="right", no_wrap=True, vertical="bottom")
     other = "other" if rows[0].is_rival else "base"
@@ -112,7 +125,7 @@ def changes_table(rows: Sequence[Change]) -> Table:
         table.add_row(
             *map(escape, shown), escape(first.scope) + _signs(first),
             *(f"{first.swept[name]:g}" if name in first.swept else "-" for name in swept),
-            *(escape(_starred(values[column])) for column in columns), falls(first),
+            *(escape(_signed_off(values[column])) for column in columns), falls(first),
             style="bold" if first.is_group else "",
         )  # fmt: skip
     return table
@@ -125,7 +138,9 @@ def _opponent(rows: Sequence[Change]) -> str:
     return f"{escape(', '.join(dict.fromkeys(row.base for row in rows)))} ({BEST_ANALYTIC})"
 
 
-_SIGNS = {HELD_OUT: "°", CEILING: "†", SAME_ROBOT: "‡"}
+_MOST = 24
+"""Longest word that is not broken."""
+_SIGNS = {HELD_OUT: "°", PARTLY: "(°)", CEILING: "†", SAME_ROBOT: "‡"}
 
 
 def _signs(row: Change) -> str:
@@ -139,6 +154,6 @@ def falls(row: Change) -> str:
     return f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes} ({row.base_falls}/{row.base_episodes})"
 
 
-def _starred(row: Change) -> str:
-    star = "" if row.verdict in ("lower", "higher") else " *"
-    return percent_interval(row.relative) + (star if np.isfinite(row.relative.value) else "")
+def _signed_off(row: Change) -> str:
+    text = percent_interval(row.relative)
+    return signed_off(text, row.verdict) if np.isfinite(row.relative.value) else text

@@ -7,14 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
 from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import BEST_ANALYTIC, percent_interval
+from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, percent_interval, signed_off
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
+from train.report.summary import width_of
 from train.runs.escaping import markdown_table, markdown_text, write_csv
 
 _BASE = ("base", "change", "change_low", "change_high", "verdict")
@@ -190,11 +197,10 @@ def said(paired: Paired | None) -> str:
 
 
 def changed(paired: Paired | None) -> str:
-    """A paired change: its value, its interval, and a star where nothing is shown."""
-    if paired is None:
+    """A paired change: its value, its interval, and a sign where nothing is shown."""
+    if paired is None or not math.isfinite(paired.change.value):
         return "-"
-    star = "" if paired.verdict in ("lower", "higher") or not math.isfinite(paired.change.value) else " *"
-    return f"{percent_interval(paired.change)}{star}"
+    return signed_off(percent_interval(paired.change), paired.verdict)
 
 
 LEGEND = (
@@ -206,7 +212,7 @@ LEGEND = (
 )
 PAIRED = (
     "Paired changes on the same episodes: interquartile mean over training seeds with its 95 % interval. Below zero, "
-    "learning is ahead. A star: not told from chance, or too few training seeds. The best policy without learning is "
+    f"learning is ahead. {SIGNS_ARE} The best policy without learning is "
     "the best of the first track in that column and metric, on the same episodes, which favours it."
 )
 
@@ -257,6 +263,40 @@ def _entry_markdown(entry: Entry) -> str:
     figures = [f"**{text}**" if best else text for text, best in zip(entry.figures, entry.is_best, strict=True)]
     failed = f" {entry.failed}" if entry.failed else ""
     return " / ".join(figures) + failed + "".join(f"<br><sub>{interval}</sub>" for interval in entry.intervals)
+
+
+def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
+    """Print the leaderboard with as many columns as the terminal has room for."""
+    main = board(found)
+    shown = len(main.columns)
+    while shown > 1 and width_of(_board_table(main, shown), console) > console.width:
+        shown -= 1
+    console.print(_board_table(main, shown))
+    if shown < len(main.columns):
+        titles = "; ".join(", ".join(column) for column in main.columns[shown:])
+        console.print(escape(f"no room for {titles}; leaderboard.md has them"), style="dim")
+
+
+def _board_table(shown: Board, columns: int) -> Table:
+    """Its first columns for the terminal, the best of each track in bold."""
+    table = Table(title=f"leaderboard, {escape(shown.what)}", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("policy", no_wrap=True, vertical="bottom")
+    for name in [f"{scope},\n{reference}" for scope, reference in shown.columns[:columns]] + ["failed", "µs"]:
+        table.add_column(escape(name), justify="right", no_wrap=True, vertical="bottom")
+    for track, rows in shown.tracks:
+        table.add_section()
+        table.add_row(Text(track, style="italic"))
+        for row in rows:
+            entries = [_entry_text(entry) for entry in row.entries[:columns]]
+            table.add_row(Text(f"  {row.policy}"), *entries, row.failed, row.step)
+    return table
+
+
+def _entry_text(entry: Entry) -> Text:
+    parts = [
+        Text(figure, style="bold" if best else "") for figure, best in zip(entry.figures, entry.is_best, strict=True)
+    ]
+    return Text(" / ").join(parts) + Text(f" {entry.failed}" if entry.failed else "")
 
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:

@@ -21,14 +21,15 @@ _ANY_WIDTH = 10_000
 
 
 def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
-    """Print the summary with as many columns as the terminal has room for."""
-    columns = [column for column in evaluations[0].condition.environment.columns if column.on_console]
-    shown = len(columns)
-    while shown > 1 and _width(summary_table(evaluations, columns[:shown]), console) > console.width:
-        shown -= 1
-    console.print(summary_table(evaluations, columns[:shown]))
-    if shown < len(columns):
-        titles = ", ".join(column.title for column in columns[shown:])
+    """Print the summary with as many columns as the terminal has room for; what policies are judged by stays."""
+    known = evaluations[0].condition.environment
+    columns = [column for column in known.columns if column.on_console]
+    judged, shown = {column.metric for column in known.judged}, list(columns)
+    while len(shown) > 1 and width_of(summary_table(evaluations, shown), console) > console.width:
+        shown.remove(next((column for column in reversed(shown) if column.metric not in judged), shown[-1]))
+    console.print(summary_table(evaluations, shown))
+    if len(shown) < len(columns):
+        titles = ", ".join(column.title for column in columns if column not in shown)
         console.print(escape(f"no room for {titles}; summary.md has them"), style="dim")
     for note in failure_notes(evaluations):
         console.print(escape(note))
@@ -163,6 +164,6 @@ def _number(value: float, column: Column) -> str:
     return f"{value:.{column.decimals}f}"
 
 
-def _width(table: Table, console: Console) -> int:
+def width_of(table: Table, console: Console) -> int:
     """Width of a table with all of its text."""
     return console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum

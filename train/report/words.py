@@ -12,9 +12,12 @@ import numpy as np
 from train.evaluate.changes import (
     BEST_ANALYTIC,
     CEILING,
+    CLAIM_SEEDS,
     FEWEST_SEEDS,
     HELD_OUT,
+    PARTLY,
     SAME_ROBOT,
+    SIGNS_ARE,
     Change,
     by_cell,
     families,
@@ -342,7 +345,7 @@ def notes(results: Results) -> list[str]:
         notes.append(
             f"The {BEST_ANALYTIC} of a cell is the one with the lowest mean on that cell's episodes, among those that "
             "read the standard sensors. It is chosen after the fact, which favours it. Failures count before scores: "
-            "who fails less often is the better one. A star: not told from chance, or too few training seeds."
+            f"who fails less often is the better one. {SIGNS_ARE}"
         )
     if any(row.is_rival for row in results.changes):
         notes.append(
@@ -353,6 +356,8 @@ def notes(results: Results) -> list[str]:
     marks = {mark for row in results.changes for mark in row.marks}
     if any(mark.startswith(HELD_OUT) for mark in marks):
         notes.append(f"Marked {HELD_OUT!r}: nothing of this scenario, or of this motion, was seen in training.")
+    if any(mark.startswith(PARTLY) for mark in marks):
+        notes.append(f"Marked {PARTLY!r}: the scenarios that are named were not seen in training, the others were.")
     if CEILING in marks:
         notes.append(
             f"Marked {CEILING!r}: the scenario is deterministic and the residual was trained on it, so that training "
@@ -368,6 +373,11 @@ def notes(results: Results) -> list[str]:
             notes.append(f"{title} is a single training seed: another one may come out differently.")
         elif len(origin.folders) < FEWEST_SEEDS:
             notes.append(f"{title} has but {len(origin.folders)} training seeds: too few to judge by its intervals.")
+        elif len(origin.folders) < CLAIM_SEEDS:
+            notes.append(
+                f"{title} has {len(origin.folders)} training seeds. Intervals over so few exclude zero too often, so "
+                f"its verdicts are provisional; a claim needs {CLAIM_SEEDS}."
+            )
         if origin.missing_seeds:
             missing = ", ".join(map(str, origin.missing_seeds))
             notes.append(f"{title} lacks training seeds of its configuration: {missing}.")

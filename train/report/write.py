@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
-from train.evaluate.changes import by_line
+from train.evaluate.changes import SIGNS_ARE, by_line
 from train.evaluate.evaluate import grouped
 from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
@@ -94,8 +94,7 @@ def _add_maps(page: Page, results: Results) -> None:
     page.section(
         "Maps",
         "Who is best where, and what learning changes against the best policy without it, in per cent: green and below "
-        "zero, learning is ahead; red and above zero, it is behind. A star: not told from chance, or too few training "
-        "seeds. A cross counts failed episodes.",
+        f"zero, learning is ahead; red and above zero, it is behind. {SIGNS_ARE} A cross counts failed episodes.",
     )
     for heat_map in results.maps:
         found = panels(heat_map)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import BEST_ANALYTIC, FEWEST_SEEDS, percent, percent_interval
+from train.evaluate.changes import BEST_ANALYTIC, FEWEST_SEEDS, percent, percent_interval, signed_off
 from train.evaluate.evaluate import grouped
 from train.evaluate.statistics import Estimate
 from train.report.pages.cells import Rows
@@ -29,8 +29,6 @@ GROUPS = ("mixture", "held out", "joined", "slope", "imu", "drawn")
 _BASE = "base of the residual"
 _SMALL = 2.0
 """Below it an angle has two decimals [mrad]."""
-_SHOWN = ("lower", "higher")
-"""Verdicts of a change that chance does not explain."""
 
 
 @dataclass(frozen=True)
@@ -162,15 +160,15 @@ def _scope(row: Mapping[str, str]) -> str:
 
 
 def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
-    """Mean of the base in mrad or mm, and the change with its interval; a star where chance explains it."""
+    """Mean of the base in mrad or mm, and the change with its interval; a sign where it is not told from chance."""
     if not row["change"]:
         return f"falls, {row['base_failed']} of {row['base_episodes']}", "-"
     change, low, high = (float(row[name]) for name in ("change", "change_low", "change_high"))
-    star = " *" if low <= 0.0 <= high or int(row["training_seeds"]) < FEWEST_SEEDS else ""
+    verdict = "unclear" if int(row["training_seeds"]) < FEWEST_SEEDS else "none" if low <= 0.0 <= high else "shown"
     base = 1e3 * float(row["base_mean"])
     return (
         f"{base:.{2 if unit == 'mrad' and base < _SMALL else 1}f}",
-        f"{_unbroken(percent_interval(Estimate(change, low, high)))}{star}",
+        signed_off(_unbroken(percent_interval(Estimate(change, low, high))), verdict),
     )
 
 
@@ -181,7 +179,6 @@ def _unbroken(interval: str) -> str:
 
 
 def _change(row: Mapping[str, str]) -> str:
-    """Relative change, with a star where chance explains it, and ✕ where a policy failed."""
-    star = "" if row["verdict"] in _SHOWN else " *"
+    """Relative change, with a sign where it is not told from chance, and ✕ where a policy failed."""
     failed = f" ✕{row['failed']}" if row["failed"] not in ("", "0") else ""
-    return f"{percent(float(row['change']))}{star}{failed}" if row["change"] else f"-{failed}"
+    return signed_off(percent(float(row["change"])), row["verdict"]) + failed if row["change"] else f"-{failed}"
