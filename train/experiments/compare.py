@@ -358,7 +358,7 @@ def _require_each_once(what: str, values: Sequence[object]) -> None:
 
 def try_out(conditions: Sequence[Condition]) -> None:
     """Make environments and policies once, so that a wrong name fails before anything runs."""
-    for condition, env in with_one_world(conditions):
+    for condition, env in with_one_world(_each_once(conditions)):
         try:
             policy = make_policy(condition.policy, env, condition.policy_options)
         except ConfigurationError as error:
@@ -369,6 +369,19 @@ def try_out(conditions: Sequence[Condition]) -> None:
             raise ConfigurationError(
                 f"policy {condition.policy.name!r} has no method predict(), got {type(policy).__name__}"
             )
+
+
+def _each_once(conditions: Sequence[Condition]) -> Iterator[Condition]:
+    """Conditions with an environment, or a policy at a motion, that no earlier one has: a sum of them, no product."""
+    seen = set[str]()
+    for condition in conditions:
+        own = {
+            repr((condition.env, condition.arguments)),
+            repr((condition.policy, condition.swept, condition.reference)),
+        }
+        if not own <= seen:
+            seen |= own
+            yield condition
 
 
 def _along(axes: Any, known: Environment) -> list[Any]:
