@@ -168,7 +168,7 @@ def test_a_page_has_the_map_with_what_is_ahead_and_what_failed() -> None:
         ["| **5**", "−25 % ✕5", "- ✕10 |"],
         ["| **0**", "−50 %", "+200 % |"],
     ]
-    assert found.sentence.startswith("**Pelvis error.** Ahead in 2 of 4 cells, behind in 1. ")
+    assert found.sentence.startswith("**Pelvis error, learned.** Ahead in 2 of 4 cells, behind in 1. ")
     assert found.sentence.endswith("is base in 2 of 4 cells.")
     Path("none.csv").write_text("policy,verdict\ninput,\n")
     with pytest.raises(ConfigurationError, match=r"none\.csv compares no residual"):

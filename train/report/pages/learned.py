@@ -36,12 +36,14 @@ class LearnedMap:
     """The change by a residual against the best policy without learning, over two axes, in one metric.
 
     Attributes:
+        policy: Title of the residual.
         metric: Column of the episodes.
         x_is, y_is: What the axes are.
         x, y: Their values as they are shown.
         cells: Row of the CSV by (x, y).
     """
 
+    policy: str
     metric: str
     x_is: str
     y_is: str
@@ -54,7 +56,7 @@ class LearnedMap:
         """From the rows of one map, metric and residual."""
         first = rows[0]
         return cls(
-            first["metric"], first["x_is"], first["y_is"],
+            first["policy"], first["metric"], first["x_is"], first["y_is"],
             list(dict.fromkeys(row["x"] for row in rows)), list(dict.fromkeys(row["y"] for row in rows)),
             {(row["x"], row["y"]): row for row in rows},
         )  # fmt: skip
@@ -74,8 +76,8 @@ class LearnedMap:
         title, _ = _METRICS[self.metric]
         common = max(dict.fromkeys(rivals), key=rivals.count)
         return (
-            f"**{title[:1].upper()}{title[1:]}.** Ahead in {verdicts.count('lower')} of {len(verdicts)} cells, "
-            f"behind in {verdicts.count('higher')}. The best policy without learning is {common} in "
+            f"**{title[:1].upper()}{title[1:]}, {self.policy}.** "
+            f"Ahead in {verdicts.count('lower')} of {len(verdicts)} cells, behind in {verdicts.count('higher')}. The best policy without learning is {common} in "
             f"{rivals.count(common)} of {len(rivals)} cells."
         )
 
