@@ -77,7 +77,8 @@ class LearnedMap:
         common = max(dict.fromkeys(rivals), key=rivals.count)
         return (
             f"**{title[:1].upper()}{title[1:]}, {self.policy}.** "
-            f"Ahead in {verdicts.count('lower')} of {len(verdicts)} cells, behind in {verdicts.count('higher')}. The best policy without learning is {common} in "
+            f"Ahead in {verdicts.count('lower')} of {len(verdicts)} cells, "
+            f"behind in {verdicts.count('higher')}. The best policy without learning is {common} in "
             f"{rivals.count(common)} of {len(rivals)} cells."
         )
 
