@@ -50,8 +50,8 @@ class WalkingGains(Model):
     zmp_filter_s: float = quantity("s", 0.03, gt=0, description="time constant of the ZMP shift")
     friction_rate_rad_s: float = quantity("rad/s", 0.01, gt=0, description="joint rate at which friction acts in full")
     weight_filter_s: float | None = None
-    """Time constant of the weight that is measured [s]. Null takes the assumed weight: a load on the robot then shortens
-    the leg that carries it."""
+    """Time constant of the weight that is measured [s]. Null takes the assumed weight. A load on the robot then
+    shortens the leg that carries it."""
 
 
 @dataclass(frozen=True)
