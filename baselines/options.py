@@ -33,7 +33,7 @@ class PolicyOptions(Model):
     com_feedback: bool = True
     """Walker: whether the controller feeds the center of mass back."""
     gains: WalkingGains | None = None
-    """Walker: gains of the controller, in place of those of the policy's name."""
+    """Walker: gains of the controller, over those that the policy's name stands for."""
     base: str = "input_output"
     """Walker: the compensated policy that `adaptive`, `posture` and `adaptive_posture` build on."""
     adaptation: AdaptationGains = AdaptationGains()

@@ -198,7 +198,7 @@ def test_calls_share_the_cores_of_this_machine(
 ) -> None:
     """Catches cores that stand idle beside one training seed, and more threads than cores."""
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert place.threads_of_each(calls) == threads
+    assert place.threads_per_call(calls) == threads
 
 
 def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

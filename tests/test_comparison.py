@@ -30,10 +30,10 @@ from train.evaluate.evaluate import Evaluation, evaluate
 from train.evaluate.families import expand
 from train.evaluate.progress import learning_curves
 from train.evaluate.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
-from train.experiments.compare import CompareConfig
+from train.experiments.compare import CompareConfig, _each_once
 from train.figures.figures import has_swept_references
 from train.report import Results, require_jinja2, require_plotly, write_report
-from train.report.changes_tables import changes_table, write_statistics
+from train.report.changes_tables import changes_table, print_changes, write_statistics
 from train.report.page import Page
 from train.runs.folders import run_folder
 
@@ -629,6 +629,34 @@ def test_compare_plays_every_training_seed_its_base_and_the_rival(compared: tupl
     page_without_plotly(folder / "report.html")
 
 
+def test_each_environment_and_each_policy_is_tried_out() -> None:
+    """Catches an environment or a policy that first fails when its turn comes, and pairs that are all tried."""
+    named = {"policies": ["input", "dynamic"], "scenarios": ["soft", "stiff", "sensor"]}
+    conditions = CompareConfig(name="c", env="walker", references=[3, 1.6], **named).conditions()  # type: ignore[arg-type]
+    tried = list(_each_once(conditions))
+    assert len(tried) == 2 * (3 + 1) < len(conditions)
+    for key in (lambda c: repr(c.arguments), lambda c: (c.policy.name, c.reference)):
+        assert {key(c) for c in tried} == {key(c) for c in conditions}
+
+
+def test_words_are_whole_where_there_are_two_residuals() -> None:
+    """Catches names of policies and scenarios that are broken where they need not be."""
+    base = cell("base", {"all": [2.0]}, "payload")
+    others = [
+        Evaluation(e.condition.replace(policy=e.condition.policy.replace(label="residual")), e.episodes)
+        for e in family([[1.0], [3.0]], "payload")
+    ]
+    rows = [
+        row for row in changes([base, *family([[1.0], [3.0]], "payload"), *others]) if row.is_family and row.is_judged
+    ]
+    for width, is_whole in ((84, True), (64, False)):
+        console = Console(width=width, record=True, file=StringIO())
+        print_changes(rows, console)
+        text = console.export_text()
+        assert ({"learned", "residual", "reference", "scenario", "payload"} <= set(text.split())) == is_whole
+        assert "0/2 (0/1)" in text  # the last column
+
+
 def test_groups_name_scenarios_that_are_played() -> None:
     """Catches a group that is silently smaller than it says, and one whose name is a scenario's."""
     with pytest.raises(ConfigurationError, match="'sof'"):
@@ -647,6 +675,8 @@ def test_tables_tell_falls_and_intervals_that_include_zero() -> None:
         console.print(changes_table([row for row in rows if row.is_family]))
         text = console.export_text()
         assert f"! 1/{2 * len(seeds)} (0/2)" in text
+        row = next(row for row in rows if row.is_family and row.is_judged)
+        assert row.mine == interquartile_mean(np.array([np.mean([v for v in own if v is not None]) for own in seeds]))
         assert f"[−50, +50] {expected}" in text
     content = write_statistics(rows, Path("statistics.csv")).read_text(encoding="utf-8")
     assert "MORE FALLS than base" in content

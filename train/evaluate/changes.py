@@ -185,6 +185,12 @@ def percent_interval(estimate: Estimate, signed: bool = True) -> str:
     return f"{value} % [{low}, {high}]"
 
 
+def signed_interval(estimate: Estimate, verdict: str) -> str:
+    """A share with its interval and the sign of its verdict, such as +1 % [−2, +4] *; - where there is none."""
+    text = percent_interval(estimate)
+    return signed_off(text, verdict) if np.isfinite(estimate.value) else text
+
+
 def families(evaluations: Sequence[Evaluation]) -> dict[str, Origin]:
     """Families of residuals by title, with how they were trained."""
     members: dict[str, dict[str, Member]] = {}

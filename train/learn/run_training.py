@@ -154,7 +154,7 @@ def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: 
     def moved(number: int) -> None:
         console.print(f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True)
 
-    threads = place.threads_of_each(len(calls))
+    threads = place.threads_per_call(len(calls))
     given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
     watch = Watch(reported=report, tallied=tallied, moved=moved)
     with place.opened(len(given), calls[0].run.folder) as pool:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -18,10 +17,10 @@ from train.evaluate.changes import (
     SIGNS_ARE,
     Change,
     by_line,
-    percent_interval,
-    signed_off,
-)  # fmt: skip
+    signed_interval,
+)
 from train.evaluate.maps import HeatMap
+from train.report.fitting import has_room
 from train.runs.escaping import write_csv
 
 
@@ -80,14 +79,16 @@ def print_changes(rows: Sequence[Change], console: Console) -> None:
     for is_rival in (False, True):
         shown = [row for row in rows if row.is_family and row.is_judged and row.is_rival == is_rival]
         if shown:
-            console.print(changes_table(shown))
+            table = changes_table(shown)
+            console.print(table if has_room(console, table) else changes_table(shown, breaks_words=True))
 
 
-def changes_table(rows: Sequence[Change]) -> Table:
+def changes_table(rows: Sequence[Change], breaks_words: bool = False) -> Table:
     """Changes of residuals against their bases, or against their rivals, a line per cell with all judged metrics.
 
     Args:
         rows: Changes of families, of one environment, all against bases or all against rivals.
+        breaks_words: Whether names may be broken, where there is little room.
     """
     columns = list(dict.fromkeys(row.column for row in rows))
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
@@ -107,12 +108,15 @@ def changes_table(rows: Sequence[Change]) -> Table:
     )  # fmt: skip
     words = {"residual": policies, "scenario": [row.scope + _signs(row) for row in rows]}
     for name in (*named, "reference", "scenario", *swept):
-        longest = max((len(word) for text in words.get(name, []) for word in text.split()), default=0)
-        table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold", min_width=min(longest, _MOST))
-    for column in columns:
-        table.add_column(column.title, justify="right", no_wrap=True, vertical="bottom")
+        longest = max(len(word) for text in (name.replace("_", " "), *words.get(name, ())) for word in text.split())
+        least = None if breaks_words else longest
+        table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold", min_width=least)
     other = "other" if rows[0].is_rival else "base"
-    table.add_column(f"{rows[0].failure}\n({other})", justify="right", no_wrap=True, vertical="bottom")
+    figures = {column.title: [_figure(row) for row in rows if row.column == column] for column in columns}
+    figures[f"{rows[0].failure}\n({other})"] = [falls(row) for row in rows]
+    for title, texts in figures.items():
+        least = max(map(len, [*title.splitlines(), *texts]))
+        table.add_column(title, justify="right", no_wrap=True, vertical="bottom", min_width=least)
     previous: tuple[str, ...] = ()
     for line in by_line(rows):
         first = line[0]
@@ -121,14 +125,18 @@ def changes_table(rows: Sequence[Change]) -> Table:
         names = (first.policy, first.reference)
         shown = ("",) * (1 + len(named)) if names == previous else names[1 - len(named) :]
         previous = names
-        values = {row.column: row for row in line}
+        values = {row.column: _figure(row) for row in line}
         table.add_row(
             *map(escape, shown), escape(first.scope) + _signs(first),
             *(f"{first.swept[name]:g}" if name in first.swept else "-" for name in swept),
-            *(escape(_signed_off(values[column])) for column in columns), falls(first),
+            *(escape(values[column]) for column in columns), falls(first),
             style="bold" if first.is_group else "",
         )  # fmt: skip
     return table
+
+
+def _figure(row: Change) -> str:
+    return signed_interval(row.relative, row.verdict)
 
 
 def _opponent(rows: Sequence[Change]) -> str:
@@ -138,8 +146,6 @@ def _opponent(rows: Sequence[Change]) -> str:
     return f"{escape(', '.join(dict.fromkeys(row.base for row in rows)))} ({BEST_ANALYTIC})"
 
 
-_MOST = 24
-"""Longest word that is not broken."""
 _SIGNS = {HELD_OUT: "°", PARTLY: "(°)", CEILING: "†", SAME_ROBOT: "‡"}
 
 
@@ -152,8 +158,3 @@ def _signs(row: Change) -> str:
 def falls(row: Change) -> str:
     """Failed episodes of all, and the base's in brackets; an exclamation mark where there are more."""
     return f"{'! ' if row.falls_more else ''}{row.falls}/{row.episodes} ({row.base_falls}/{row.base_episodes})"
-
-
-def _signed_off(row: Change) -> str:
-    text = percent_interval(row.relative)
-    return signed_off(text, row.verdict) if np.isfinite(row.relative.value) else text

@@ -15,13 +15,13 @@ from rich.text import Text
 
 from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, percent_interval, signed_off
+from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
-from train.report.summary import width_of
+from train.report.fitting import print_fitting
 from train.runs.escaping import markdown_table, markdown_text, write_csv
 
 _BASE = ("base", "change", "change_low", "change_high", "verdict")
@@ -198,9 +198,7 @@ def said(paired: Paired | None) -> str:
 
 def changed(paired: Paired | None) -> str:
     """A paired change: its value, its interval, and a sign where nothing is shown."""
-    if paired is None or not math.isfinite(paired.change.value):
-        return "-"
-    return signed_off(percent_interval(paired.change), paired.verdict)
+    return "-" if paired is None else signed_interval(paired.change, paired.verdict)
 
 
 LEGEND = (
@@ -268,27 +266,28 @@ def _entry_markdown(entry: Entry) -> str:
 def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
     """Print the leaderboard with as many columns as the terminal has room for."""
     main = board(found)
-    shown = len(main.columns)
-    while shown > 1 and width_of(_board_table(main, shown), console) > console.width:
-        shown -= 1
-    console.print(_board_table(main, shown))
-    if shown < len(main.columns):
-        titles = "; ".join(", ".join(column) for column in main.columns[shown:])
-        console.print(escape(f"no room for {titles}; leaderboard.md has them"), style="dim")
+    print_fitting(
+        console,
+        range(len(main.columns)),
+        lambda places: _board_table(main, places),
+        lambda place: ", ".join(main.columns[place]),
+        "leaderboard.md",
+    )
 
 
-def _board_table(shown: Board, columns: int) -> Table:
-    """Its first columns for the terminal, the best of each track in bold."""
-    table = Table(title=f"leaderboard, {escape(shown.what)}", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+def _board_table(main: Board, places: Sequence[int]) -> Table:
+    """Some of its columns for the terminal, the best of each track in bold."""
+    table = Table(title=f"leaderboard, {escape(main.what)}", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("policy", no_wrap=True, vertical="bottom")
-    for name in [f"{scope},\n{reference}" for scope, reference in shown.columns[:columns]] + ["failed", "µs"]:
+    for name in [",\n".join(main.columns[at]) for at in places] + ["failed", "µs"]:
         table.add_column(escape(name), justify="right", no_wrap=True, vertical="bottom")
-    for track, rows in shown.tracks:
+    for track, rows in main.tracks:
         table.add_section()
         table.add_row(Text(track, style="italic"))
         for row in rows:
-            entries = [_entry_text(entry) for entry in row.entries[:columns]]
-            table.add_row(Text(f"  {row.policy}"), *entries, row.failed, row.step)
+            table.add_row(
+                Text(f"  {row.policy}"), *(_entry_text(row.entries[at]) for at in places), row.failed, row.step
+            )
     return table
 
 

@@ -15,22 +15,23 @@ from rich.table import Table
 
 from train.evaluate.environments import Column, Environment
 from train.evaluate.evaluate import Evaluation
+from train.report.fitting import print_fitting
 from train.runs.escaping import markdown_table, markdown_text, write_records
-
-_ANY_WIDTH = 10_000
 
 
 def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
     """Print the summary with as many columns as the terminal has room for; what policies are judged by stays."""
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
-    judged, shown = {column.metric for column in known.judged}, list(columns)
-    while len(shown) > 1 and width_of(summary_table(evaluations, shown), console) > console.width:
-        shown.remove(next((column for column in reversed(shown) if column.metric not in judged), shown[-1]))
-    console.print(summary_table(evaluations, shown))
-    if len(shown) < len(columns):
-        titles = ", ".join(column.title for column in columns if column not in shown)
-        console.print(escape(f"no room for {titles}; summary.md has them"), style="dim")
+    judged = {column.metric for column in known.judged}
+    print_fitting(
+        console,
+        columns,
+        lambda shown: summary_table(evaluations, shown),
+        lambda column: column.title,
+        "summary.md",
+        stays=lambda column: column.metric in judged,
+    )
     for note in failure_notes(evaluations):
         console.print(escape(note))
 
@@ -162,8 +163,3 @@ def _swept_values(evaluation: Evaluation, names: Sequence[str]) -> list[str]:
 
 def _number(value: float, column: Column) -> str:
     return f"{value:.{column.decimals}f}"
-
-
-def width_of(table: Table, console: Console) -> int:
-    """Width of a table with all of its text."""
-    return console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum

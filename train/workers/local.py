@@ -33,6 +33,11 @@ def require_jobs(jobs: int) -> None:
         raise ConfigurationError(f"jobs must be {bound}, 0 for one per core, got {shown(jobs)}")
 
 
+def num_processes(jobs: int, calls: int) -> int:
+    """Processes for some calls: `jobs`, or one per core where that is 0, and no more than calls."""
+    return min(jobs or os.cpu_count() or 1, calls)
+
+
 @contextmanager
 def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
     """Processes of this machine, which end with what is within.
@@ -45,7 +50,7 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
         sys.exit(1)  # this is a worker that imports the script of its parent, which says why it ended
     resource_tracker.ensure_running()  # its start lets SIGINT through, and the threads that start workers block it
     events: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    processes = Processes(min(jobs or os.cpu_count() or 1, calls), events)
+    processes = Processes(num_processes(jobs, calls), events)
     try:
         yield Pool(processes, _report, events)
     except BaseException:

@@ -10,7 +10,7 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, shown
 from train.workers.calls import Pool
 from train.workers.dask_cluster import dask_pool
-from train.workers.local import local_pool, require_jobs
+from train.workers.local import local_pool, num_processes, require_jobs
 from train.workers.slurm import SlurmConfig, slurm_pool
 
 LOCAL = "local"
@@ -47,12 +47,9 @@ class Place:
         """Whether it is this machine."""
         return self.on == LOCAL
 
-    def threads_of_each(self, calls: int) -> int:
-        """Threads of each of some calls: an equal share of the cores of this machine; elsewhere one."""
-        if not self.is_local:
-            return 1
-        cores = os.cpu_count() or 1
-        return max(1, cores // min(self.jobs or cores, calls))
+    def threads_per_call(self, calls: int) -> int:
+        """Threads for each of some calls: an equal share of the cores of this machine; elsewhere one."""
+        return max(1, (os.cpu_count() or 1) // num_processes(self.jobs, calls)) if self.is_local else 1
 
     @contextmanager
     def opened(self, calls: int, folder: Path) -> Iterator[Pool]:
