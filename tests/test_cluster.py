@@ -16,6 +16,7 @@ import pytest
 from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
+from elastic_env.core.files import flush
 from tests.cluster_trials import SINE, dask_cluster, free_port
 from tests.test_training import PPO, SMALL, weights
 from train.cells.key import cell_key
@@ -27,7 +28,6 @@ from train.evaluate.evaluate import Evaluation, evaluate, evaluate_together
 from train.learn.run_training import start
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
-from train.runs.whole import flush
 from train.workers.calls import Watch, WorkerKilledError, run_calls
 from train.workers.places import Place
 from train.workers.versions import VersionsDifferError, require_same
@@ -115,15 +115,6 @@ def test_a_kept_cell_is_what_was_played(tmp_path: Path) -> None:
     assert list(found.trace) == list(played.trace)
     for name, values in played.trace.items():
         np.testing.assert_array_equal(found.trace[name], values)
-
-
-def test_a_damaged_cell_is_played_again(tmp_path: Path) -> None:
-    """Catches a traceback for, or trust in, a file that lost its end."""
-    store = Store(tmp_path)
-    store.keep(evaluate(CONDITIONS[0], num_threads=1))
-    (file,) = tmp_path.iterdir()
-    file.write_bytes(file.read_bytes()[:-20])
-    assert store.get(CONDITIONS[0]) is None
 
 
 def test_only_what_is_missing_is_played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -253,7 +244,7 @@ def test_a_disk_that_takes_no_more_keeps_the_cells_before(
             raise OSError(code, os.strerror(code))
         flushed(path)
 
-    monkeypatch.setattr("train.runs.whole.flush", full)
+    monkeypatch.setattr("elastic_env.core.files.flush", full)
     with pytest.raises(SystemExit) as caught:
         main(["compare", "c.yaml", "--output", "run", "--jobs", "1"])
     said = capsys.readouterr().err
@@ -262,7 +253,7 @@ def test_a_disk_that_takes_no_more_keeps_the_cells_before(
     assert "finished cells are kept; go on with: elastic compare --resume run" in said
     assert "Traceback" not in said
     assert [file.suffix for file in kept.iterdir()] == [".npz"] * 2
-    monkeypatch.setattr("train.runs.whole.flush", flushed)
+    monkeypatch.setattr("elastic_env.core.files.flush", flushed)
     main(["compare", "--resume", "run"])
     assert "2 of 3 cells are kept" in capsys.readouterr().out
     for name in ("episodes.csv", "statistics.csv"):

@@ -8,14 +8,15 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
+from elastic_env.core.files import read_bounded, write_whole
+from train.experiments.compare import recorded
 from train.learn.run_training import resume
-from train.runs.folders import free_folder, locked, new_run
+from train.runs.folders import free_folder, locked, new_run, require_run
 
 
 @pytest.fixture(autouse=True)
@@ -62,22 +63,21 @@ def test_what_is_in_the_way_is_said(obstacle: str, tmp_path: Path) -> None:
 
 def test_a_run_that_cannot_be_described_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Catches a folder with a configuration alone, where the disk got full behind it."""
-    monkeypatch.setattr(Path, "write_text", full_at("metadata.json"))
+    monkeypatch.setattr("train.runs.folders.write_whole", full_at("metadata.json"))
     with pytest.raises(OSError, match="No space"):
         new_run("x", {"a": 1}, 0)
     assert list((tmp_path / "runs").iterdir()) == []
 
 
-def full_at(name: str) -> Callable[..., int]:
-    """`Path.write_text` on a disk that gets full at a file."""
-    write = Path.write_text
+def full_at(name: str) -> Callable[..., None]:
+    """`write_whole` on a disk that gets full at a file."""
 
-    def write_text(path: Path, text: str, **options: Any) -> int:
+    def write(path: Path, text: str) -> None:
         if path.name == name:
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        return write(path, text, **options)
+        write_whole(path, text)
 
-    return write_text
+    return write
 
 
 HOLD = """
@@ -119,11 +119,145 @@ def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -
             assert (tmp_path / ".lock").read_text() == f"{os.getpid()} of {platform.node()}\n"
 
 
-def test_a_run_that_is_resumed_runs_no_code_of_its_folder(tmp_path: Path) -> None:
-    """Catches a folder from elsewhere whose algorithm lies beside its configuration."""
-    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nclass Algorithm: pass\n")
-    text = (Path(__file__).parents[1] / "configs" / "train_testbed.yaml").read_text()
-    (tmp_path / "config.yaml").write_text(f"algorithm: evil:Algorithm\n{text}")
-    with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code"):
+def mark_when_imported(folder: Path) -> Path:
+    """A module and a package, `evil` and `evil_room.inner`, whose import leaves a mark: the file of it."""
+    mark = folder / "ran"
+    for name in ("evil.py", "residual:evil.py", "evil_room/__init__.py", "evil_room/inner.py"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(f"open({str(mark)!r}, 'w')\nROBOT = make = Algorithm = lambda env: None\n")
+    return mark
+
+
+CODE = ["evil.py:make", "evil:make", "evil_room.inner:make", "./evil.py:make"]
+
+
+@pytest.mark.parametrize("code", [*CODE, "residual:evil.py:make"])
+@pytest.mark.parametrize("field", ["algorithm", "env", "base"])
+def test_a_training_that_is_resumed_runs_no_code_of_its_folder(
+    field: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a folder from elsewhere whose algorithm, robot or base lies beside its configuration."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    mark = mark_when_imported(tmp_path)
+    (tmp_path / "config.yaml").write_text(f"{field}: '{code}'\n")
+    with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code|must be no residual"):
         resume([tmp_path], Console(quiet=True))
-    assert not (tmp_path / "ran").exists()
+    assert not mark.exists()
+
+
+FIELDS = {
+    "env": "env: '{}'",
+    "policy": "policies: ['{}']",
+    "policy's name": "policies: [{{name: '{}', label: mine}}]",
+    "env without sense": "env: '{}'\nmap: {{x: 3}}",
+}
+
+
+@pytest.mark.parametrize("code", CODE)
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_comparison_that_is_resumed_runs_no_code_of_its_folder(
+    field: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches an import while the configuration is read, before anybody asked whether the folder is trusted."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    mark = mark_when_imported(tmp_path)
+    (tmp_path / "config.yaml").write_text(f"name: x\n{FIELDS[field].format(code)}\n")
+    with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code"):
+        recorded(tmp_path)
+    assert not mark.exists()
+
+
+def test_a_robot_that_is_called_like_a_residual_is_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an exception for policies in folders that holds for other fields too."""
+    mark = mark_when_imported(tmp_path)
+    (tmp_path / "config.yaml").write_text("name: x\nenv: 'residual:evil.py:ROBOT'\n")
+    with pytest.raises(ConfigurationError, match="whose code would run"):
+        recorded(tmp_path)
+    assert not mark.exists()
+
+
+def test_a_comparison_that_is_trusted_runs_its_code(tmp_path: Path) -> None:
+    """Catches a folder of one's own that cannot be gone on with."""
+    mark_when_imported(tmp_path)
+    (tmp_path / "config.yaml").write_text("name: x\npolicies: ['evil.py:make', 'residual:evil']\n")
+    assert [policy.name for policy in recorded(tmp_path, trust_code=True).policies][0] == "evil.py:make"
+
+
+@pytest.mark.parametrize("place", ["summary.md", "cells", "cells/x.npz", ".lock", "config.yaml", "seed_0/best.new"])
+def test_a_run_with_a_link_out_of_it_is_not_gone_on_with(place: str, tmp_path: Path) -> None:
+    """Catches files of the user's that are overwritten, locked or read through a run from elsewhere."""
+    run = tmp_path / "run"
+    (run / place).parent.mkdir(parents=True)
+    mine = tmp_path / "mine"
+    mine.write_text("name: x\n")
+    if place != "config.yaml":
+        (run / "config.yaml").write_text("name: x\n")
+    (run / place).symlink_to("../" * place.count("/") + "../mine")
+    for go_on in (recorded, lambda folder: resume([folder], Console(quiet=True))):
+        with pytest.raises(ConfigurationError, match=f"{place} is a link that leads out of .*run"):
+            go_on(run)
+    assert mine.read_text() == "name: x\n"
+
+
+def test_a_run_may_be_a_link_and_have_links_to_itself(tmp_path: Path) -> None:
+    """Catches a refusal of runs/latest, and of a best policy that is a link to one of the run's own."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text("name: x\n")
+    (tmp_path / "run" / "best").symlink_to("last")
+    (tmp_path / "latest").symlink_to("run")
+    assert require_run(tmp_path / "latest", "run", "compare wrote").name == "config.yaml"
+
+
+@pytest.mark.parametrize("kind", ["link", "second name", "pipe", "folder"])
+def test_a_lock_is_a_file_of_its_own(kind: str, tmp_path: Path) -> None:
+    """Catches a lock through which another file is emptied, or that is waited for."""
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    lock = tmp_path / ".lock"
+    {
+        "link": lambda: lock.symlink_to(mine),
+        "second name": lambda: lock.hardlink_to(mine),
+        "pipe": lambda: os.mkfifo(lock),
+        "folder": lock.mkdir,
+    }[kind]()
+    with pytest.raises(ConfigurationError, match="must be a plain file with one name"), locked(tmp_path):
+        pass
+    assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("link", ["symbolic", "hard"])
+def test_a_file_is_written_in_the_place_of_a_link(link: str, tmp_path: Path) -> None:
+    """Catches a writer that follows a link, at the file or beside it, and one that keeps the group from reading."""
+    mine, summary = tmp_path / "mine", tmp_path / "summary.md"
+    mine.write_text("mine")
+    for path in (summary, tmp_path / f".summary.md.{os.getpid()}.new"):
+        (path.symlink_to if link == "symbolic" else path.hardlink_to)(mine)
+    write_whole(summary, "äöü")
+    assert mine.read_text() == "mine"
+    assert summary.read_bytes() == "äöü".encode()
+    assert not summary.is_symlink()
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert summary.stat().st_mode == plain.stat().st_mode
+    assert {path.name for path in tmp_path.iterdir()} == {"mine", "summary.md", "plain"}
+
+
+def test_a_file_is_read_within_its_bounds(tmp_path: Path) -> None:
+    """Catches a pipe that is waited for, a device without an end, and a large file that is read to be refused."""
+    file, pipe, link = tmp_path / "file", tmp_path / "pipe", tmp_path / "link"
+    file.write_bytes(b"12345")
+    os.mkfifo(pipe)
+    link.symlink_to("/dev/zero")
+    assert read_bounded(file, 5, within=tmp_path) == b"12345"
+    with pytest.raises(ConfigurationError, match="at most 4 bytes, it has 5"):
+        read_bounded(file, 4)
+    with pytest.raises(ConfigurationError, match="must be a plain file"):
+        read_bounded(pipe, 5)
+    with pytest.raises(ConfigurationError, match="must be a plain file"):
+        read_bounded(link, 5)
+    with pytest.raises(ConfigurationError, match="is a link out of its folder"):
+        read_bounded(link, 5, within=tmp_path)
+    with pytest.raises(ConfigurationError, match="at most 5 bytes"):
+        read_bounded(Path("/proc/self/environ"), 5)
+    with pytest.raises(IsADirectoryError):
+        read_bounded(tmp_path, 5)

@@ -14,6 +14,7 @@ from safetensors.numpy import save
 from baselines.adaptation.learned_signals import LearningGains
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
 
@@ -61,8 +62,8 @@ def save_table(folder: Path, description: TableDescription, table: Array) -> Non
     """
     _require_table(description, table)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / OFFSETS).write_bytes(save({_TENSOR: np.ascontiguousarray(table)}))
-    (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    write_whole(folder / OFFSETS, save({_TENSOR: np.ascontiguousarray(table)}))
+    write_whole(folder / DESCRIPTION, description.model_dump_json(indent=2) + "\n")
 
 
 def read_table_description(folder: Path) -> TableDescription:
@@ -72,10 +73,15 @@ def read_table_description(folder: Path) -> TableDescription:
         ConfigurationError: There is none, or it is not valid.
     """
     return load_json(
-        folder / DESCRIPTION, TableDescription, "table",
-        lambda why: f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed ({why}), "
-        "as `elastic iterate` writes it",
-    )  # fmt: skip
+        folder / DESCRIPTION,
+        TableDescription,
+        what="table",
+        missing=lambda why: (
+            f"nothing learned lies at {folder}: a folder with {DESCRIPTION} and {OFFSETS} is needed ({why}), "
+            "as `elastic iterate` writes it"
+        ),
+        within=folder,
+    )
 
 
 def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
@@ -84,7 +90,8 @@ def load_table(folder: Path, env: Any) -> tuple[TableDescription, Array]:
     Raises:
         ConfigurationError: There is none, it is damaged, or it was learned for something else.
     """
-    description, tensors = read_table_description(folder), read_tensors(folder / OFFSETS)
+    description = read_table_description(folder)
+    tensors, _ = read_tensors(folder / OFFSETS)
     if set(tensors) != {_TENSOR}:
         raise ConfigurationError(f"{folder / OFFSETS} must hold one tensor, {_TENSOR!r}, got {shown(sorted(tensors))}")
     table = np.asarray(tensors[_TENSOR], dtype=np.float64)

@@ -4,6 +4,7 @@ A folder holds `residual.json` (base, settings, network, how it was trained) and
 no code from it and needs no torch. The observation is normalised in here; the base policy sees it as it is.
 """
 
+import os
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
@@ -22,6 +23,7 @@ from baselines.residual.residual_kernels import count_due, count_step
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
 
@@ -174,9 +176,9 @@ def save_residual(folder: Path, description: ResidualDescription, tensors: Tenso
     Network(description, tensors)
     folder.mkdir(parents=True, exist_ok=True)
     weights = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
-    (folder / WEIGHTS).write_bytes(weights)  # its own file writer has an error of its own for a full disk
+    write_whole(folder / WEIGHTS, weights)
     description = description.replace(weights_sha256=sha256(weights).hexdigest())
-    (folder / DESCRIPTION).write_text(description.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    write_whole(folder / DESCRIPTION, description.model_dump_json(indent=2) + "\n")
 
 
 def shipped() -> list[str]:
@@ -187,7 +189,7 @@ def shipped() -> list[str]:
 def located(folder: Path) -> Path:
     """A residual's folder: the path itself, or where nothing lies there, the one of that name in the package."""
     own = _SHIPPED / folder
-    return own if not folder.exists() and own.exists() else folder
+    return own if not os.path.exists(folder) and os.path.exists(own) else folder  # of any text, however long
 
 
 def read_description(folder: Path) -> ResidualDescription:
@@ -197,7 +199,13 @@ def read_description(folder: Path) -> ResidualDescription:
         ConfigurationError: There is none, or it is not valid.
     """
     folder = located(folder)
-    return load_json(folder / DESCRIPTION, ResidualDescription, "residual", lambda why: _none_at(folder, why))
+    return load_json(
+        folder / DESCRIPTION,
+        ResidualDescription,
+        what="residual",
+        missing=lambda why: _none_at(folder, why),
+        within=folder,
+    )
 
 
 def _none_at(folder: Path, why: str) -> str:
@@ -225,12 +233,13 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
         ConfigurationError: There is none, or it is damaged.
     """
     folder = located(folder)
-    description, tensors = read_description(folder), read_tensors(folder / WEIGHTS)
+    description = read_description(folder)
+    tensors, content = read_tensors(folder / WEIGHTS)
     try:
         network = Network(description, tensors)
     except ConfigurationError as error:
         raise ConfigurationError(f"{folder / WEIGHTS} holds no network: {error}") from None
-    found = sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    found = sha256(content).hexdigest()
     if description.weights_sha256 not in (None, found):
         raise ConfigurationError(
             f"{folder / WEIGHTS} was changed: {DESCRIPTION} names the SHA-256 digest {description.weights_sha256}, "

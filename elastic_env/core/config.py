@@ -17,7 +17,8 @@ from pydantic_core.core_schema import no_info_before_validator_function
 
 from elastic_env.core.config_problems import ModelError, problems_of
 from elastic_env.core.errors import ConfigurationError, shown
-from elastic_env.core.json_text import parse_json
+from elastic_env.core.files import read_bounded
+from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 
 ModelT = TypeVar("ModelT", bound="Model")
@@ -120,6 +121,8 @@ MOST_ENTRIES = 1000
 """Entries of a list in a configuration."""
 LARGEST_SEED = 2**63 - 1
 """Seeds of episodes are 64-bit integers."""
+_BYTES = 4
+"""Most bytes of a character in UTF-8."""
 
 
 def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] | None = None) -> ModelT:
@@ -143,7 +146,9 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
         raise ConfigurationError(f"in {file}: {error}") from None
 
 
-def load_json(path: Path, model: type[ModelT], what: str, missing: Callable[[str], str]) -> ModelT:
+def load_json(
+    path: Path, model: type[ModelT], what: str, missing: Callable[[str], str], within: Path | None = None
+) -> ModelT:
     """Read a JSON file into a validated model.
 
     Args:
@@ -151,12 +156,15 @@ def load_json(path: Path, model: type[ModelT], what: str, missing: Callable[[str
         model: What it becomes.
         what: What the file describes, such as residual.
         missing: What to say where it cannot be read, for a reason.
+        within: Folder that the file must lie in, after all links; None for anywhere.
 
     Raises:
         ConfigurationError: The file cannot be read, is not a JSON mapping, or does not fit the model.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(read_bounded(path, _BYTES * LARGEST_JSON, within).decode("utf-8"))
+    except ConfigurationError:
+        raise
     except OSError as error:
         raise ConfigurationError(missing(str(error.strerror))) from None
     except ValueError as error:
@@ -200,12 +208,10 @@ def _text_of(file: Path) -> str:
     try:
         if file.is_dir():
             raise ConfigurationError(f"{file} is a folder, a YAML file is needed")
-        if not file.is_file():
+        if not file.exists():
             known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
             listing = f"; found beside it: {', '.join(known)}" if known else ""
             raise ConfigurationError(f"no configuration file at {shown(str(file))[1:-1]}{listing}")
-        if file.stat().st_size > 4 * LARGEST_TEXT:  # bytes of a character in UTF-8
-            raise ConfigurationError(f"{file} is too long for a configuration: more than {LARGEST_TEXT} characters")
-        return file.read_text(encoding="utf-8")
+        return read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8")
     except OSError as error:
         raise ConfigurationError(f"{shown(str(file))} cannot be read: {error.strerror}") from None

@@ -4,30 +4,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError, deserialize
+from safetensors.numpy import load
 
 from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.files import read_bounded
 
 _MOST_BYTES = 100_000_000
 _FILE_TYPES = ("F32", "F64")
 
 
-def read_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Tensors of a file of safetensors.
+def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
+    """Tensors of a file of safetensors, and the content of the file that they were read from.
 
     Raises:
-        ConfigurationError: It is missing, cut short, too large, something else, or holds other than real numbers.
+        ConfigurationError: It is missing, cut short, too large, something else, holds other than real numbers, or is
+            a link that leads out of its folder.
     """
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ConfigurationError(f"{path} must have at most {_MOST_BYTES} bytes, it has {path.stat().st_size}")
-        with safe_open(path, framework="np") as file:
-            for name in file.keys():  # noqa: SIM118  no mapping
-                if (kind := file.get_slice(name).get_dtype()) not in _FILE_TYPES:
-                    raise ConfigurationError(
-                        f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {kind}"
-                    )
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        content = read_bounded(path, _MOST_BYTES, within=path.parent)
+        for name, tensor in deserialize(content):
+            if (kind := tensor["dtype"]) not in _FILE_TYPES:
+                raise ConfigurationError(
+                    f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {shown(kind)}"
+                )
+        return load(content), content
     except (OSError, SafetensorError) as error:
         raise ConfigurationError(
             f"{path} cannot be read: it is missing, cut short or something else ({error}); copy it anew"

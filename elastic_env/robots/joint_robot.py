@@ -136,7 +136,7 @@ class JointRobot:
             scenario=make_scenario(scenario, walks=False),
             joints=joints,
             form=form,
-            sensors=tuple(sensors),
+            sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
             reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
             **({} if timestep_s is None else {"timestep_s": timestep_s}),
         )

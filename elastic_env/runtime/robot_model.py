@@ -1,6 +1,5 @@
 """What a compensator may know of a robot: its rigid model and the parameters of its elastic joints."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,8 @@ import numpy.typing as npt
 
 from elastic_env.core.config import plain_numbers
 from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.files import read_bounded
+from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
 from elastic_env.dynamics.biped import Biped
 from elastic_env.joint.elasticity import ElasticJoint, Servo
@@ -167,13 +168,15 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
         return float(value)  # pyright: ignore[reportArgumentType]  a Path is no number, which is what is asked
     except (TypeError, ValueError):
         path = Path(value)  # pyright: ignore[reportArgumentType]
-    if not path.is_file():
-        raise ConfigurationError(
-            f"stiffness must be a number [N·m/rad] or an identification file, found no file {path}"
-        )
     try:
-        return float(json.loads(path.read_text())[STIFFNESS_KEY])
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+        content = read_bounded(path, LARGEST_JSON)
+    except (OSError, ValueError):
+        raise ConfigurationError(
+            f"stiffness must be a number [N·m/rad] or an identification file, found no such file {shown(str(path))}"
+        ) from None
+    try:
+        return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
+    except (KeyError, TypeError, ValueError):
         raise ConfigurationError(
             f"{path} is no identification: it must be JSON with a number {STIFFNESS_KEY!r}, see `elastic identify`"
         ) from None

@@ -8,24 +8,35 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from baselines.adaptation import offset_table
 from baselines.policies import is_saved
+from baselines.residual import residual
 from baselines.residual.residual import located
+from elastic_env.core.files import read_bounded
 from train.evaluate.conditions import Condition
 from train.evaluate.robot_file import files_of_robot
 from train.workers.versions import physics
 
 _NOT_OF_THE_RESULT = {"policy": {"level", "track"}, "member": {"rival"}}
 """Parts of a condition that change nothing of its episodes: what it is compared with, and where tables list it."""
+_LABELS = {"label": True, "policy": {"label"}, "member": {"base"}}
+"""Parts of a condition that are text for people and name no files."""
+_SAVED = (residual.DESCRIPTION, residual.WEIGHTS, offset_table.DESCRIPTION, offset_table.OFFSETS)
+"""Files of which the folder of a policy consists."""
+_LARGEST_SOURCE = 10_000_000
+"""Bytes of a Python file that is looked through for imports."""
 
 
 def cell_key(condition: Condition) -> str:
     """SHA-256 digest of a condition, of the files that it names, and of the versions of the physics.
 
     Files are weights of residuals, tables of offsets and stiffness, robots with their models and joints, and Python
-    files of the user's, with those of their folder that they import. What such a file reads when it runs is not seen.
+    files of the user's, with those of their folder that they import. They are read and never imported. What such a file
+    reads when it runs is not seen. Labels are text and name no files.
     """
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
-    files = {str(file): _digest(file) for text in _texts(content) for file in named_files(text)}
+    named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
+    files = {str(file): _digest(file) for text in _texts(named) for file in named_files(text)}
     whole = {"condition": content, "files": files, "versions": physics()}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
 
@@ -34,13 +45,13 @@ def named_files(text: str) -> list[Path]:
     """Files that a text of a configuration stands for: residual:FOLDER, FILE.py:NAME, module:NAME, or a path."""
     if is_saved(text):
         folder = located(Path(text.partition(":")[2]))
-        return sorted(file for file in folder.glob("*") if file.is_file())
+        return [folder / name for name in _SAVED if _is_file(folder / name)]
     place, _, name = text.rpartition(":")
     if name.isidentifier() and place.endswith(".py"):
-        return sorted(_with_imports(Path(place), set()))
+        return _with_imports(Path(place))
     if name.isidentifier() and (source := _source(place)):
-        return sorted(_with_imports(source, set()))
-    return [Path(text), *files_of_robot(text)] if _is_file(Path(text)) else []
+        return _with_imports(source)
+    return [file for file in (Path(text), *files_of_robot(text)) if _is_file(file)] if _is_file(Path(text)) else []
 
 
 def _is_file(path: Path) -> bool:
@@ -51,29 +62,51 @@ def _is_file(path: Path) -> bool:
 
 
 def _source(module: str) -> Path | None:
-    """The file of a module; None where there is none."""
+    """The file of a module; None where there is none. Neither it nor the packages around it are imported."""
+    package, *parts = module.split(".")
+    if not all(part.isidentifier() for part in (package, *parts)):
+        return None
     try:
-        found = importlib.util.find_spec(module) if module else None
+        found = importlib.util.find_spec(package)  # which would import the packages around a name with dots
     except (ImportError, ValueError):
         return None
-    return Path(found.origin) if found is not None and found.origin and found.origin.endswith(".py") else None
+    if found is None:
+        return None
+    if not parts:
+        return Path(found.origin) if found.origin and found.origin.endswith(".py") else None
+    for folder in found.submodule_search_locations or ():
+        for file in _files_of(Path(folder).joinpath(*parts)):
+            if _is_file(file):
+                return file
+    return None
 
 
-def _with_imports(file: Path, seen: set[Path]) -> set[Path]:
-    """A Python file and those that it imports from its own folder, and these from there."""
-    if file in seen or not _is_file(file):
-        return seen
-    seen.add(file)
-    for name in _imported(file):
-        path = file.parent.joinpath(*name.split("."))
-        _with_imports(path.with_suffix(".py"), seen)
-        _with_imports(path / "__init__.py", seen)
-    return seen
+def _files_of(module: Path) -> list[Path]:
+    """Where a module lies by its path without an ending: a package, or a file."""
+    return [module / "__init__.py", module.with_name(f"{module.name}.py")]
+
+
+def _with_imports(file: Path) -> list[Path]:
+    """A Python file and those that it imports from its own folder, and these from there, in order of their names."""
+    seen = set[Path]()
+    waiting = [file]
+    while waiting:
+        file = waiting.pop()
+        if file in seen or not _is_file(file):
+            continue
+        seen.add(file)
+        for name in _imported(file):
+            waiting += _files_of(file.parent.joinpath(*name.split(".")))
+    return sorted(seen)
 
 
 def _imported(file: Path) -> Iterator[str]:
-    """Modules that a file imports, by full name."""
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    """Modules that a file imports, by full name; none of a file that is no Python, which cannot be imported itself."""
+    try:
+        tree = ast.parse(read_bounded(file, _LARGEST_SOURCE))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -91,4 +124,5 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from elastic_env.core.errors import ElasticError
 from train.cells.key import cell_key
-from train.cells.store import Store
+from train.cells.store import Store, UnfitCellError
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import (
     MOST_WORLDS,
@@ -25,6 +25,9 @@ from train.runs.failures import DEFECT, explained
 from train.runs.progress import Show, plain_progress, show_progress
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.places import HERE, Place
+
+_MOST_NAMED = 5
+"""Cells that one line names."""
 
 
 class CellsFailedError(ElasticError):
@@ -64,7 +67,7 @@ def run_conditions(
         return [
             _on_hardware(condition, f"{n} of {len(conditions)}", console) for n, condition in enumerate(conditions, 1)
         ]
-    kept = [None if store is None or fresh else store.get(condition) for condition in conditions]
+    kept = [None] * len(conditions) if store is None or fresh else _kept(conditions, store, console)
     missing = [condition for condition, found in zip(conditions, kept, strict=True) if found is None]
     if len(missing) < len(conditions):
         console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept", soft_wrap=True)
@@ -77,6 +80,23 @@ def run_conditions(
     if None in results:
         raise KeyboardInterrupt
     return finished
+
+
+def _kept(conditions: Sequence[Condition], store: Store, console: Console) -> list[Evaluation | None]:
+    """Cells that a store has; those whose files do not fit are said, once, and not taken."""
+    found = list[Evaluation | None]()
+    unfit = list[str]()
+    for condition in conditions:
+        try:
+            found.append(store.get(condition))
+        except UnfitCellError as error:
+            found.append(None)
+            unfit.append(f"{_name(condition)} ({error})")
+    if unfit:
+        more = f", and {len(unfit) - _MOST_NAMED} more" if len(unfit) > _MOST_NAMED else ""
+        said = f"kept cells that do not fit are played again: {'; '.join(unfit[:_MOST_NAMED])}{more}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False)
+    return found
 
 
 class _Playing:

@@ -165,7 +165,10 @@ class Condition(Model):
         motion = self.environment.arguments(self.reference)
         found = {"scenario": self.scenario_played, **self.env_options, **self.policy.env_options, **motion}
         needed = sensors_needed(self.policy.name)
-        return {**found, "sensors": [*dict.fromkeys([*found.get("sensors", ()), *needed])]} if needed else found
+        given = found.get("sensors", [])
+        if not needed or not isinstance(given, list | tuple):  # the environment says what sensors are
+            return found
+        return {**found, "sensors": [*given, *(name for name in needed if name not in given)]}
 
     @property
     def scenario_played(self) -> str | Scenario:

@@ -18,8 +18,11 @@ from train.runs.user_code import named_object
 Reference: TypeAlias = str | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
 
-UNPLACED = ("num_envs", "num_threads", "autoreset_mode", "render_mode")
-"""Arguments of the environments that have no place in a comparison."""
+UNPLACED = (
+    "num_envs", "num_threads", "autoreset_mode", "render_mode", "id", "vectorization_mode", "vector_kwargs", "wrappers",
+    "self",
+)  # fmt: skip
+"""Arguments of the environments, and of the functions that make them, that have no place in a comparison."""
 RESERVED = ("scenario", *UNPLACED)
 """These, and the argument that has a key of its own."""
 

@@ -324,6 +324,16 @@ def _record(
     condition: Condition, episode: int, info: dict[str, Any], world: int, further: list[dict[str, float]]
 ) -> dict[str, Any]:
     metrics = {name: values[world].item() for name, values in info["episode_metrics"].items()}
+    return {
+        **words_of(condition, episode),
+        "termination": str(info["termination"][world]),
+        **metrics,
+        **{name: value for metrics in further for name, value in metrics.items()},
+    }
+
+
+def words_of(condition: Condition, episode: int) -> dict[str, Any]:
+    """What the record of an episode says before it is played: cell, training seed, and seed of the episode."""
     member = condition.member
     seed = None if member is None else member.training_seed
     return {
@@ -335,9 +345,6 @@ def _record(
         **condition.environment.abscissa(condition.reference),
         **condition.swept,
         "seed": condition.seed + episode,
-        "termination": str(info["termination"][world]),
-        **metrics,
-        **{name: value for metrics in further for name, value in metrics.items()},
     }
 
 

@@ -1,17 +1,20 @@
 """What a training says of itself on the way, read without what trained it."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import read_bounded
 from elastic_env.core.signals import Array
 from train.evaluate.environments import Column
 
 PROGRESS = "progress.csv"
+_MOST_BYTES = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,25 +31,55 @@ class Curves:
     ratios: dict[str, Array]
 
 
-def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Evaluations on the way of a training seed, as its `progress.csv` has them."""
-    with (folder / PROGRESS).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [{key: value if key == "scenario" else float(value) for key, value in row.items()} for row in rows]
+def read_progress(folder: Path, metrics: Sequence[str]) -> list[dict[str, Any]]:
+    """Evaluations on the way of a training seed, as its `progress.csv` has them.
+
+    Args:
+        folder: Of the training seed.
+        metrics: Scores that are needed, of the policy and of its base.
+
+    Raises:
+        ConfigurationError: The file is missing, is no such table, or lacks a score.
+    """
+    path = folder / PROGRESS
+    try:
+        text = read_bounded(path, _MOST_BYTES).decode("utf-8")
+        rows = [_evaluation(row, metrics) for row in csv.DictReader(text.splitlines())]
+    except ConfigurationError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise ConfigurationError(
+            f"{path} must be the table of a training, with {', '.join(_columns(metrics))}: {error}"
+        ) from None
+    if not rows:
+        raise ConfigurationError(f"{path} has no evaluations")
+    return rows
+
+
+def _columns(metrics: Sequence[str]) -> list[str]:
+    return ["decisions", *metrics, *(f"base_{metric}" for metric in metrics), "failed"]
+
+
+def _evaluation(row: Mapping[str, str], metrics: Sequence[str]) -> dict[str, Any]:
+    """Numbers of a row, and its scenario."""
+    found: dict[str, Any] = {name: float(row[name]) for name in _columns(metrics)}
+    for metric in metrics:
+        if found[f"base_{metric}"] == 0.0:
+            raise ValueError(f"base_{metric} is zero")
+    return {**found, "scenario": row["scenario"]}
 
 
 def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves | None:
-    """Curves of policies that lie in their training runs, beside `progress.csv`; None where one of them does not.
+    """Curves of policies that lie in their training runs, beside a whole `progress.csv`; None where one does not.
 
     Args:
         folders: Folders of the policies, such as runs/NAME/seed_0/last.
         columns: Metrics that training was evaluated by.
     """
     runs = [Path(folder).resolve().parent for folder in folders]
-    if not all((run / PROGRESS).is_file() for run in runs):
-        return None
-    tables = [read_progress(run) for run in runs]
-    if any(column.metric not in row for table in tables for row in table for column in columns):
+    try:
+        tables = [read_progress(run, [column.metric for column in columns]) for run in runs]
+    except ConfigurationError:
         return None
     decisions = sorted(set.intersection(*({row["decisions"] for row in table} for table in tables)))
     if not decisions:

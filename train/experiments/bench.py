@@ -15,6 +15,7 @@ from rich.table import Table
 
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
@@ -105,9 +106,9 @@ def bench(path: Path, console: Console, update: bool = False, output: Path | Non
             for case, evaluation in zip(config.cases, evaluations, strict=True)
             for figure in _figures(case, evaluation, config.margin)
         ]
-        (folder / "bench.json").write_text(json.dumps([_plain(figure) for figure in figures], indent=2) + "\n")
+        write_whole(folder / "bench.json", json.dumps([_plain(figure) for figure in figures], indent=2) + "\n")
         markdown = _markdown(figures)
-        (folder / "bench.md").write_text(markdown)
+        write_whole(folder / "bench.md", markdown)
     summary = os.environ.get("GITHUB_STEP_SUMMARY")
     if summary:
         with Path(summary).open("a", encoding="utf-8") as file:
@@ -170,7 +171,7 @@ def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> N
     for node, value in sorted(changes, key=lambda change: -change[0].start_mark.index):
         begin, end = node.start_mark.index, node.end_mark.index
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
-    path.write_text(text, encoding="utf-8")
+    write_whole(path.resolve(), text)  # the user named it, maybe by a link
 
 
 def _figure_nodes(text: str) -> list[dict[str, yaml.Node]]:

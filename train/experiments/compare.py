@@ -30,8 +30,9 @@ from train.report.changes_tables import print_changes, write_maps, write_statist
 from train.report.leaderboard import print_leaderboard, write_leaderboard
 from train.report.robots_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
-from train.runs.folders import CONFIG, describe, locked, run_folder
+from train.runs.folders import describe, locked, require_run, run_folder
 from train.runs.kinds import is_a
+from train.runs.user_code import code_refused, require_no_code
 from train.workers.places import HERE, Place
 
 _MOST_CELLS = 10_000
@@ -302,16 +303,13 @@ def recorded(folder: Path, trust_code: bool = False) -> CompareConfig:
     Raises:
         ConfigurationError: The folder is no comparison, or names code that is not trusted.
     """
-    file = folder / CONFIG
-    if not file.is_file():
-        raise ConfigurationError(f"{folder} is no run: it has no {CONFIG}; name the folder that compare wrote")
-    config = load_yaml(file, CompareConfig)
-    for name in (config.env, *(policy.name for policy in config.policies)):
-        if ":" in name and not is_saved(name) and not trust_code:
-            raise ConfigurationError(
-                f"{file} names code of its own, {name!r}, which would run; look at it, then name your configuration "
-                "before --resume, or say --trust-code"
-            )
+    file = require_run(folder, "run", "compare wrote")
+    if trust_code:
+        return load_yaml(file, CompareConfig)
+    with code_refused(file):
+        config = load_yaml(file, CompareConfig)
+    policies = [policy.name for policy in config.policies if not is_saved(policy.name)]
+    require_no_code(file, [config.env, *policies])
     return config
 
 
@@ -323,8 +321,7 @@ def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[
         with run_folder(config.name, content, config.seed, output) as folder, locked(folder):
             yield folder
         return
-    if not (output / CONFIG).is_file():
-        raise ConfigurationError(f"{output} is no run: it has no {CONFIG}; name the folder that compare wrote")
+    require_run(output, "run", "compare wrote")
     with locked(output):
         describe(output, content, config.seed)
         yield output

@@ -1,5 +1,6 @@
 """What all figures share: style, colours, files; and the bar chart of a whole comparison."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.errors import missing_extra
+from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import Evaluation
 
@@ -83,7 +85,9 @@ def columns_of(entries: int, widest: int = 5) -> int:
 
 def save(figure: Any, path: Path) -> Path:
     """Write a figure and forget it."""
-    figure.savefig(path, bbox_inches="tight")
+    content = io.BytesIO()
+    figure.savefig(content, format=path.suffix[1:], bbox_inches="tight")
+    write_whole(path, content.getvalue())
     require_matplotlib().close(figure)
     return path
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from elastic_env.core.errors import ElasticError
-from train.runs.whole import flush
+from elastic_env.core.files import flush
 
 _DIGESTS = "sha256.json"
 

@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ConfigurationError
 from train.evaluate.environments import environment
 from train.evaluate.progress import read_progress
 from train.learn.train_config import CONSTANTS, TrainConfig
 from train.learn.trainer import Trainer
-from train.runs.folders import CONFIG, locked, locked_part, require_name, run_folder
+from train.runs.folders import locked, locked_part, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
+from train.runs.user_code import code_refused, require_no_code
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.places import Place
 
@@ -92,15 +92,12 @@ def resume(
 
 def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
     """The configuration of a run that is gone on with."""
-    if not (folder / CONFIG).is_file():
-        raise ConfigurationError(f"{folder} is no training run: it has no {CONFIG}; name the folder that train printed")
-    config = load_yaml(folder / CONFIG, TrainConfig)
-    for what, name in (("an algorithm", config.algorithm), ("a robot", config.env)):
-        if ":" in name and not trust_code:
-            raise ConfigurationError(
-                f"{folder / CONFIG} names {what} of its own, {name!r}, whose code would run; look at it, then say "
-                "--trust-code"
-            )
+    file = require_run(folder, "training run", "train printed")
+    if trust_code:
+        return load_yaml(file, TrainConfig)
+    with code_refused(file):
+        config = load_yaml(file, TrainConfig)
+    require_no_code(file, [config.algorithm, config.env, config.base])
     return config
 
 
@@ -207,7 +204,7 @@ def _table(config: TrainConfig, folder: Path) -> Table:
     for name in ("seed", "scenario", *(column.label for column in columns), "failed"):
         table.add_column(name, justify="left" if name == "scenario" else "right")
     for seed in config.seeds:
-        rows = read_progress(folder / f"seed_{seed}")
+        rows = read_progress(folder / f"seed_{seed}", [column.metric for column in columns])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
             scores = [_change(row[f"base_{column.metric}"], row[column.metric], column.scale) for column in columns]
             table.add_row(str(seed), row["scenario"], *scores, f"{row['failed']:.0f}")

@@ -1,6 +1,7 @@
 """A training on its way: scores against the base on episodes that it never learns from, best and last policy."""
 
 import csv
+import io
 import shutil
 from collections.abc import Sequence
 from contextlib import closing
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from baselines.residual.residual import ResidualDescription, save_residual
+from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array, BoolArray
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
@@ -74,14 +76,13 @@ class Scores:
 
     def forget_after(self, decisions: int) -> None:
         """Drop evaluations that were made after the checkpoint that is gone on with; they will be made again."""
-        path, fresh = self._folder / PROGRESS, self._folder / f"{PROGRESS}.new"
+        path = self._folder / PROGRESS
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
         kept = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",")[0]) <= decisions]
         if decisions == 0 or not lines:
             path.unlink(missing_ok=True)
             return
-        fresh.write_text("".join([lines[0], *kept]))
-        fresh.replace(path)
+        write_whole(path, "".join([lines[0], *kept]))
 
     def _played(self, policy: str, metrics: list[str]) -> list[tuple[list[float], int]]:
         """For each scenario means of metrics over the episodes that did not fail, and how many did."""
@@ -94,12 +95,13 @@ class Scores:
 
 
 def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
-    is_new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")  # as `Scores.forget_after` leaves it
-        if is_new:
-            writer.writerow(header)
-        writer.writerows(rows)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")  # as `Scores.forget_after` leaves it
+    if not path.exists():
+        writer.writerow(header)
+    writer.writerows(rows)
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    write_whole(path, before + text.getvalue())
 
 
 def played_together(

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from baselines.catalogue import Track
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
 from train.evaluate.evaluate import grouped
@@ -302,7 +303,7 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they agree."""
     table, text = folder / "leaderboard.csv", folder / "leaderboard.md"
     write_csv(_HEAD, map(_record, found), table)
-    text.write_text(f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}", encoding="utf-8")
+    write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")
     return [table, text]
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column, Environment
 from train.evaluate.evaluate import Evaluation
 from train.report.fitting import print_fitting
@@ -113,7 +114,7 @@ def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """The summary table and its splits as Markdown: medians, and the worst episode in brackets; by environment."""
     groups = [list(group) for _, group in groupby(evaluations, key=lambda evaluation: evaluation.condition.env)]
-    path.write_text("\n\n".join(part for group in groups for part in _summarised(group)) + "\n")
+    write_whole(path, "\n\n".join(part for group in groups for part in _summarised(group)) + "\n")
     return path
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
+from elastic_env.core.files import write_whole
 from train.evaluate.changes import SIGNS_ARE, by_line
 from train.evaluate.evaluate import grouped
 from train.figures.figures import swept_scenarios
@@ -36,8 +37,8 @@ def require_plotly() -> str:
 def write_report(results: Results) -> list[Path]:
     """Write `report.html` and `report.md` beside the other files of a comparison."""
     page, text = results.folder / "report.html", results.folder / "report.md"
-    page.write_text(_page(results).html(require_plotly()), encoding="utf-8")
-    text.write_text(markdown(results), encoding="utf-8")
+    write_whole(page, _page(results).html(require_plotly()))
+    write_whole(text, markdown(results))
     return [page, text]
 
 

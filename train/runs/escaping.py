@@ -2,11 +2,14 @@
 
 import csv
 import html
+import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from elastic_env.core.files import write_whole
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _NUMBERS = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?( [-+]?(nan|[\d.]+(e[-+]?\d+)?))*")
@@ -28,8 +31,9 @@ def csv_row(values: Iterable[Any]) -> list[Any]:
 
 def write_csv(head: Sequence[str], rows: Iterable[Iterable[Any]], path: Path) -> Path:
     """Write a CSV file."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([head, *map(csv_row, rows)])
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(map(csv_row, [head, *rows]))
+    write_whole(path, text.getvalue())
     return path
 
 

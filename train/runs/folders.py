@@ -1,11 +1,13 @@
 """Result folders: never overwritten, each with the configuration, seed, versions and commit that made it."""
 
 import contextlib
+import errno
 import fcntl
 import itertools
 import json
 import os
 import platform
+import stat
 import subprocess
 import time
 from collections.abc import Iterable, Iterator
@@ -18,7 +20,7 @@ from typing import Any, TextIO
 import yaml
 
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, SystemFailedError
-from train.runs.whole import write_whole
+from elastic_env.core.files import leads_out, write_whole
 
 RUNS = Path("runs")
 """Where results go unless a folder is named."""
@@ -26,6 +28,8 @@ RUNS = Path("runs")
 CONFIG = "config.yaml"
 """File of a run with its resolved configuration."""
 _LOCK, _RETRY_S = ".lock", 0.2
+_LONGEST_HOLDER = 200
+"""Characters of a lock that say who holds it."""
 _PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
 
 
@@ -48,7 +52,7 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
     texts = _description(configuration, seed)
     try:
         for file, text in texts.items():
-            (folder / file).write_text(text)
+            write_whole(folder / file, text)
     except BaseException:
         _remove(folder, texts)
         raise
@@ -58,7 +62,7 @@ def new_run(name: str, configuration: dict[str, Any], seed: int | None, output: 
 def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> None:
     """Write down anew what the results of a run depend on, when it is gone on with; arguments as `new_run`."""
     for file, text in _description(configuration, seed).items():
-        write_whole(folder / file, text.encode())
+        write_whole(folder / file, text)
 
 
 def _description(configuration: dict[str, Any], seed: int | None) -> dict[str, str]:
@@ -67,6 +71,30 @@ def _description(configuration: dict[str, Any], seed: int | None) -> dict[str, s
         CONFIG: yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
         "metadata.json": json.dumps(provenance(seed), indent=2) + "\n",
     }
+
+
+def require_run(folder: Path, what: str, writer: str) -> Path:
+    """The configuration of a run that is gone on with.
+
+    Args:
+        folder: Of the run.
+        what: What kind of run it has to be, in words.
+        writer: Who made such a folder, in words.
+
+    Raises:
+        ConfigurationError: The folder has no configuration, or something in it is a link that leads out of it.
+    """
+    file = folder / CONFIG
+    if not file.is_file():
+        raise ConfigurationError(f"{folder} is no {what}: it has no {CONFIG}; name the folder that {writer}")
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(place, name)
+            if path.is_symlink() and leads_out(path, folder):
+                raise ConfigurationError(
+                    f"{path} is a link that leads out of {folder}, where nothing is to be changed; remove it"
+                )
+    return file
 
 
 def free_folder(name: str, output: Path | None = None) -> Path:
@@ -112,22 +140,44 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
         patience_s: How long another program is waited for [s].
 
     Raises:
-        ConfigurationError: Another program works on it.
+        ConfigurationError: Another program works on it, or the lock is no file of its own.
     """
-    with (folder / _LOCK).open("a+") as file:
+    with _opened_lock(folder / _LOCK) as file:
         last = time.monotonic() + patience_s
         while not _is_taken(file):
             if time.monotonic() >= last:
-                file.seek(0)
+                holder = file.read(_LONGEST_HOLDER).strip() or "unknown"
                 raise ConfigurationError(
-                    f"another program, process {file.read().strip() or 'unknown'}, works on {folder}; wait until it "
-                    "has ended, or end it"
+                    f"another program, process {holder}, works on {folder}; wait until it has ended, or end it"
                 )
             time.sleep(_RETRY_S)
         file.truncate(0)
         file.write(f"{os.getpid()} of {platform.node()}\n")
         file.flush()
         yield
+
+
+def _opened_lock(path: Path) -> TextIO:
+    """The file of a lock, for reading and writing; a link, a pipe or a file of two names is none.
+
+    Raises:
+        ConfigurationError: It is one of these.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise _no_lock(path) from None
+        raise
+    found = os.fstat(descriptor)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1:
+        os.close(descriptor)
+        raise _no_lock(path)
+    return os.fdopen(descriptor, "r+", encoding="utf-8", errors="replace")
+
+
+def _no_lock(path: Path) -> ConfigurationError:
+    return ConfigurationError(f"{path} must be a plain file with one name, it is a link or something else; remove it")
 
 
 def _is_taken(lock: TextIO) -> bool:

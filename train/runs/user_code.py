@@ -1,19 +1,57 @@
 """Code of the user that a name stands for: "module:function", or "FILE.py:function".
 
-Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual folder runs code.
+Naming it runs it: that is what the name is for. Nothing else of a configuration or a residual folder runs code. A
+configuration that was found in the folder of a run, rather than named by the user, is read within `code_refused`: all
+imports go through `named_object`, which then imports nothing.
 """
 
 import importlib
 import importlib.util
 import inspect
 import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 
 _FILES = "elastic_user_file_"
+_REFUSED_IN: ContextVar[Path | None] = ContextVar("refused_in", default=None)
+
+
+@contextmanager
+def code_refused(file: Path) -> Iterator[None]:
+    """Refuse to import within what names stand for.
+
+    Args:
+        file: Where the names come from.
+    """
+    before = _REFUSED_IN.set(file)
+    try:
+        yield
+    finally:
+        _REFUSED_IN.reset(before)
+
+
+def require_no_code(file: Path, names: Iterable[str]) -> None:
+    """Refuse names that stand for code; arguments as `code_refused`, and the names.
+
+    Raises:
+        ConfigurationError: One of them does.
+    """
+    for name in names:
+        if ":" in name:
+            raise _untrusted(file, name)
+
+
+def _untrusted(file: Path, name: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"{file} names {shown(name)}, whose code would run; look at it, then say --trust-code, or name a "
+        "configuration of yours"
+    )
 
 
 def named_object(name: str) -> Any:
@@ -23,8 +61,11 @@ def named_object(name: str) -> Any:
         name: "module:attribute", or "FILE.py:attribute" with the path of a file, which need not be on the module path.
 
     Raises:
-        ConfigurationError: There is no such module, file or attribute, or it fails while it is imported.
+        ConfigurationError: There is no such module, file or attribute, or it fails while it is imported; or code is
+            refused here, and nothing was imported.
     """
+    if (file := _REFUSED_IN.get()) is not None:
+        raise _untrusted(file, name)
     place, _, attribute = name.rpartition(":")
     try:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)

@@ -58,7 +58,7 @@ def configure_testbed(
         joint=chosen,
         pendulum=pendulum if isinstance(pendulum, Pendulum) else Pendulum(**(pendulum or {})),
         form=form,
-        sensors=tuple(sensors),
+        sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         observe_link=observe_link,
         reward=reward if isinstance(reward, RewardWeights) else RewardWeights(**(reward or {})),
         **({} if timestep_s is None else {"timestep_s": timestep_s}),

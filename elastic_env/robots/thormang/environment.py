@@ -80,7 +80,7 @@ def configure_walk(
         robot=chosen,
         joints=tuple(joints.values()),
         form=form,
-        sensors=tuple(sensors),
+        sensors=sensors,  # pyright: ignore[reportArgumentType]  the model takes any sequence
         reward=reward if isinstance(reward, WalkRewardWeights) else WalkRewardWeights(**(reward or {})),
         bank=bank,
         **({} if timestep_s is None else dict[str, Any](timestep_s=timestep_s)),
