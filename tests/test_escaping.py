@@ -6,20 +6,141 @@ import io
 import json
 import math
 import re
+import warnings
+from collections.abc import Callable
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
 from train.report.page import Page
 from train.report.parts import Chart
-from train.runs.escaping import chart_text, csv_row, markdown_table, script_json
+from train.runs.console import PlainConsole, traceback_of, visible_warnings
+from train.runs.escaping import (
+    chart_text,
+    csv_row,
+    markdown_table,
+    markdown_text,
+    script_json,
+    visible,
+    write_records,
+)
+from train.runs.progress import show_progress
 
 NASTY = [
     "<!--<script>", "</script><b>", "a|b", "a\nb", "=cmd|' /C calc'!A0", "-1+2", "@x", "\tx", "&lt;", "\u2028", "ok",
 ]  # fmt: skip
 """Labels that mean something to a browser, a spreadsheet or Markdown."""
+
+COMMANDS = [
+    *map(chr, [*range(9), *range(0x0B, 0x20), *range(0x7F, 0xA0)]),
+    "\u061c", "\u200e", "\u200f", "\u202a", "\u202d", "\u202e", "\u2066", "\u2069", "\udc9b",
+]  # fmt: skip
+"""What a terminal obeys, what turns the order of letters around, and half a character."""
+HOSTILE = "a" + "".join(COMMANDS) + "]8;;http://x[31mb"
+
+
+def test_a_text_keeps_its_letters_and_loses_its_commands() -> None:
+    """Catches U+009B, a carriage return, and letters of other scripts that are taken for commands."""
+    assert visible(HOSTILE) == "a" + "�" * len(COMMANDS) + "]8;;http://x[31mb"
+    assert visible("τ_J 関節 שלום 🤖 a\tb\n") == "τ_J 関節 שלום 🤖 a\tb\n"
+
+
+def shown_by(console: PlainConsole, print_it: Callable[[PlainConsole], None]) -> str:
+    """What a console writes to its terminal, without the colours of Rich."""
+    print_it(console)
+    written: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return re.sub(r"\x1b\[[\d;]*m", "", written)
+
+
+def table_of(text: str) -> Table:
+    table = Table(title=escape(text), caption=escape(text))
+    table.add_column(escape(text))
+    table.add_row(escape(text))
+    table.add_row(Text(text))
+    return table
+
+
+PRINTED: dict[str, Callable[[PlainConsole], None]] = {
+    "text": lambda console: console.print(f"wrote {HOSTILE}", soft_wrap=True),
+    "object": lambda console: console.print(Text(HOSTILE)),
+    "table": lambda console: console.print(table_of(HOSTILE)),
+    "rule": lambda console: console.rule(HOSTILE),
+    "error": lambda console: console.print(Text.assemble(("error:", "bold red"), HOSTILE), soft_wrap=True),
+}
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+@pytest.mark.parametrize("name", PRINTED)
+def test_a_console_obeys_no_text(name: str, is_terminal: bool) -> None:
+    """Catches a label that moves the cursor, sets the title of the window, or turns a line around."""
+    console = PlainConsole(file=io.StringIO(), width=400, force_terminal=is_terminal)
+    written = shown_by(console, PRINTED[name])
+    assert "�]8;;http://x[31mb" in written
+    assert not set(COMMANDS) & set(written)
+
+
+@pytest.mark.parametrize("text", ["[/bold] x", "[link=file:///x]y[/link]", "\\[mm] [bold]x", "a:smile:b"])
+def test_a_printed_text_is_no_markup(text: str) -> None:
+    """Catches a path or a label that ends a command with an error of Rich's, or becomes a link."""
+    console = PlainConsole(file=io.StringIO(), width=100, force_terminal=True)
+    assert shown_by(console, lambda console: console.print(text)) == f"{text}\n"
+
+
+def test_progress_and_warnings_obey_no_text() -> None:
+    """Catches the name of a folder in a bar, and that of a joint in a warning."""
+    console = PlainConsole(file=io.StringIO(), width=100, force_terminal=True)
+    with show_progress(console, {f"[/x] {HOSTILE}": 2}) as show:
+        show(0, 1, f"[/x] {HOSTILE}")
+    written = re.sub(r"\x1b\[[\d;]*[A-Za-ln-z]", "", console.file.getvalue())  # type: ignore[attr-defined]
+    assert "\x9b" not in written
+    assert "\u202e" not in written
+    with visible_warnings():
+        said = warnings.formatwarning(f"the joint {HOSTILE}", UserWarning, "file.py", 3)
+    assert "the joint a�" in said
+    assert not set(COMMANDS) & set(said)
+    assert not set(COMMANDS) & set(traceback_of(ValueError(HOSTILE)))
+
+
+def test_files_obey_no_text(tmp_path: Path) -> None:
+    """Catches a file that runs commands where somebody looks at it with cat."""
+    path = write_records([{f"x{HOSTILE}": HOSTILE, "y": f"\x1b={HOSTILE}"}], tmp_path / "x.csv")
+    text = markdown_table([HOSTILE], ["---"], [[HOSTILE]])
+    page = page_of(HOSTILE)
+    data = script_json({"name": [HOSTILE]})
+    for written in (path.read_text(encoding="utf-8"), text, page, data, chart_text(HOSTILE)):
+        assert not (set(COMMANDS) - {"\r"}) & set(written)
+        assert "�" in written
+    assert "\\u001b" not in data
+
+
+LINKS = [
+    "[a](http://x)", "![a](http://x/y.png)", "![a][b]", "[a][b]", "[a]: http://x", "http://x.y", "HTTPS://x.y",
+    "www.x.org", "ftp://x.y", "\\[a](x)", "[a\\](x)", "[a](<x>)", "<http://x>", "![](x)", "[![a](b)](c)",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("label", LINKS)
+def test_a_label_is_no_link_of_markdown(label: str) -> None:
+    """Catches a report that loads a picture from elsewhere, or leads there, read by a parser that is not ours."""
+    parser = MarkdownIt("commonmark")
+    assert re.search("(http|https|ftp)://|www[.]", markdown_text(label), re.IGNORECASE) is None, "links of GitHub's"
+    for text in (markdown_text(label), f"* {markdown_text(label)}", f"# {markdown_text(label)}"):
+        tokens = [part for token in parser.parse(text) for part in (token, *(token.children or ()))]
+        assert not {"link_open", "image", "html_inline", "html_block"} & {token.type for token in tokens}
+        (shown,) = ["".join(part.content for part in t.children or ()) for t in tokens if t.type == "inline"]
+        assert shown == label
+
+
+def test_intervals_stay_as_they_are_in_markdown() -> None:
+    """Catches brackets that are escaped for nothing in every table."""
+    assert markdown_text("12.3 [11.0, 13.5] residual:seed_[0-4] a_b") == "12.3 [11.0, 13.5] residual:seed_[0-4] a_b"
 
 
 class Scripts(HTMLParser):
@@ -74,7 +195,7 @@ def test_no_cell_of_a_csv_file_is_a_formula(row: list[object]) -> None:
         if isinstance(value, str):
             is_number = re.fullmatch(r"[-+]?[\d.]+", cell) is not None
             assert is_number or not cell.startswith(("=", "+", "-", "@", "\t", "\r"))
-            assert cell.removeprefix("'") == value.removeprefix("'")
+            assert cell.removeprefix("'") == visible(value).removeprefix("'")
         else:
             assert cell == value or math.isnan(value)  # type: ignore[arg-type]
 

@@ -180,7 +180,7 @@ def test_a_comparison_that_is_trusted_runs_its_code(tmp_path: Path) -> None:
     """Catches a folder of one's own that cannot be gone on with."""
     mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text("name: x\npolicies: ['evil.py:make', 'residual:evil']\n")
-    assert [policy.name for policy in recorded(tmp_path, trust_code=True).policies][0] == "evil.py:make"
+    assert recorded(tmp_path, trust_code=True).policies[0].name == "evil.py:make"
 
 
 @pytest.mark.parametrize("place", ["summary.md", "cells", "cells/x.npz", ".lock", "config.yaml", "seed_0/best.new"])

@@ -4,7 +4,6 @@ A folder holds `residual.json` (base, settings, network, how it was trained) and
 no code from it and needs no torch. The observation is normalised in here; the base policy sees it as it is.
 """
 
-import os
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
@@ -189,7 +188,10 @@ def shipped() -> list[str]:
 def located(folder: Path) -> Path:
     """A residual's folder: the path itself, or where nothing lies there, the one of that name in the package."""
     own = _SHIPPED / folder
-    return own if not os.path.exists(folder) and os.path.exists(own) else folder  # of any text, however long
+    try:
+        return own if not folder.exists() and own.exists() else folder
+    except OSError:  # too long for a path, or within a folder that cannot be read
+        return folder
 
 
 def read_description(folder: Path) -> ResidualDescription:

@@ -7,20 +7,19 @@ import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
 from train.commands.options import CONSOLE
 from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, Robot, View
+from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explained
 from train.runs.progress import say_what_is_compiled
 
@@ -50,10 +49,10 @@ def _told(error: Exception) -> int:
     """Say what failed; the exit code."""
     found = explained(error)
     if found is None:
-        traceback.print_exception(error)
+        sys.stderr.write(traceback_of(error))
     said, code = found or (f"this is a defect of elastic-env, please report it: {type(error).__name__}", DEFECT)
-    line = f"[bold red]error:[/] {escape(_with_notes(error, said))}"
-    Console(stderr=True, emoji=False).print(line, highlight=False, soft_wrap=True)
+    line = Text.assemble(("error:", "bold red"), f" {_with_notes(error, said)}")
+    PlainConsole(stderr=True).print(line, highlight=False, soft_wrap=True)
     return code
 
 
@@ -100,7 +99,7 @@ def main(arguments: list[str] | None = None) -> None:
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
             command = _command(arguments)
-            with say_what_is_compiled(CONSOLE):
+            with say_what_is_compiled(CONSOLE), visible_warnings():
                 command.run()
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
@@ -109,7 +108,5 @@ def main(arguments: list[str] | None = None) -> None:
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-            Console(stderr=True, emoji=False).print(
-                _with_notes(error, said), highlight=False, markup=False, soft_wrap=True
-            )
+            PlainConsole(stderr=True).print(_with_notes(error, said), highlight=False, soft_wrap=True)
             os._exit(128 + number)  # worker processes must not keep the terminal waiting

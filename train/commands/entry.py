@@ -4,6 +4,7 @@ import contextlib
 import os
 import sys
 
+from train.runs.escaping import visible
 from train.runs.failures import SYSTEM_FAILED, explained, is_interrupt
 
 
@@ -38,7 +39,7 @@ def _end_without_output(error: OSError) -> None:
     if not isinstance(error, BrokenPipeError):
         said, _ = explained(error) or (str(error), SYSTEM_FAILED)
         with contextlib.suppress(OSError):
-            sys.stderr.write(f"error: {said}\n")
+            sys.stderr.write(visible(f"error: {said}\n"))
             sys.stderr.flush()
     # what is left to write goes nowhere, at the interpreter's end too
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from rich.console import Console
 
 from elastic_env.core.config_problems import ModelError, ParameterPath
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.yaml_text import parse_yaml
+from train.runs.console import PlainConsole
 
-CONSOLE = Console(emoji=False)  # a policy of the user may be called mine:zero
+CONSOLE = PlainConsole()
 """Where the commands say what they do."""
 
 DEFAULT_SCENARIO = "nominal"

@@ -11,6 +11,7 @@ import yaml
 from pydantic import Field, model_validator
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
@@ -210,8 +211,8 @@ def _table(figures: list[Figure]) -> Table:
     last = ""
     for case, metric, measured, _, bound, verdict in _rows(figures):
         if case != last:
-            table.add_row(case, "", "", "")
-        table.add_row(f"  {metric}", measured, bound, verdict)
+            table.add_row(escape(case), "", "", "")
+        table.add_row(escape(f"  {metric}"), measured, bound, verdict)
         last = case
     return table
 

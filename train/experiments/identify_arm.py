@@ -121,7 +121,7 @@ def run_arm_identification(
         files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
     console.print(result_table(result))
     for line in [summed_up(fit), *remarks(result, fit)]:
-        console.print(escape(line), highlight=False)
+        console.print(line, highlight=False, markup=False)
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True, markup=False)
     return result

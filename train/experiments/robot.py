@@ -305,7 +305,7 @@ def _pictures(config: RobotConfig, plant: JointPlant, folder: Path, console: Con
     try:
         image = picture(config, plant)
     except ElasticError as error:
-        console.print(escape(f"no picture: {error}"), soft_wrap=True)
+        console.print(f"no picture: {error}", soft_wrap=True, markup=False)
         return []
     import PIL.Image
 

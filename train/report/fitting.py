@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from rich.console import Console, ConsoleOptions
-from rich.markup import escape
 from rich.table import Table
 
 _ANY_WIDTH = 10_000
@@ -36,7 +35,7 @@ def print_fitting(
     console.print(table(shown))
     if len(shown) < len(columns):
         titles = "; ".join(title(column) for column in columns if column not in shown)
-        console.print(escape(f"no room for {titles}; {file} has them"), style="dim")
+        console.print(f"no room for {titles}; {file} has them", style="dim", markup=False)
 
 
 def has_room(console: Console, table: Table) -> bool:

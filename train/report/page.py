@@ -9,7 +9,7 @@ from elastic_env.core.errors import missing_extra
 from train.evaluate.changes import CEILING, Change, percent_interval
 from train.report.changes_tables import falls
 from train.report.parts import FONT, NIGHT, VERDICTS
-from train.runs.escaping import script_json
+from train.runs.escaping import script_json, template_value
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -60,8 +60,9 @@ def require_jinja2() -> "Template":
     except ImportError:
         raise missing_extra("jinja2", "report", "writing a report") from None
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        finalize=template_value,
+    )  # fmt: skip
     environment.filters.update(falls=falls, means=_means, percent=percent_interval, script_json=script_json)
     environment.globals.update(ceiling=CEILING, font=FONT, night=NIGHT, verdicts=VERDICTS)
     return environment.get_template("page.html.j2")

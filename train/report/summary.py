@@ -34,7 +34,7 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
         stays=lambda column: column.metric in judged,
     )
     for note in failure_notes(evaluations):
-        console.print(escape(note))
+        console.print(note, markup=False)
 
 
 def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column] | None = None) -> Table:

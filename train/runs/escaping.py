@@ -1,4 +1,8 @@
-"""Text of a user, such as the label of a policy, in the formats of results: each has signs that mean something."""
+"""Text of a user, such as the label of a policy, in the formats of results: each has signs that mean something.
+
+All outlets go through `visible`: the console, tables of CSV, Markdown and the page of a report. What a terminal would
+obey, and what turns the order of letters around, is shown as �.
+"""
 
 import csv
 import html
@@ -15,13 +19,28 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _NUMBERS = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?( [-+]?(nan|[\d.]+(e[-+]?\d+)?))*")
 """Numbers side by side, which are no formula whatever their sign."""
 _SPACE = re.compile(r"[^\S\N{NO-BREAK SPACE}]+")
+_COMMANDS = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # controls, C0 and C1, but for tab and newline
+    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # direction of writing
+    "\ud800-\udfff]"  # halves of characters, which no stream takes
+)
+_LINK = re.compile(r"\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\.", re.IGNORECASE)
+"""Signs of Markdown without which a text is no link and no image."""
 _IN_SCRIPT = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
+
+
+def visible(text: str) -> str:
+    """Text without anything that a terminal obeys or that turns letters around; tabs and newlines stay."""
+    return _COMMANDS.sub("�", text)
 
 
 def csv_cell(value: Any) -> Any:
     """A cell of a CSV file; text that a spreadsheet would take for a formula gets an apostrophe in front."""
-    is_formula = isinstance(value, str) and value.startswith(_FORMULA) and not _NUMBERS.fullmatch(value)
-    return f"'{value}" if is_formula else value
+    if not isinstance(value, str):
+        return value
+    text = visible(value)
+    is_formula = text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text)
+    return f"'{text}" if is_formula else text
 
 
 def csv_row(values: Iterable[Any]) -> list[Any]:
@@ -44,8 +63,18 @@ def write_records(records: Sequence[Mapping[str, Any]], path: Path) -> Path:
 
 
 def markdown_text(text: str) -> str:
-    """Plain text in Markdown, in one line, also within a table; no-break spaces stay."""
-    return html.escape(_SPACE.sub(" ", text).strip(), quote=False).replace("|", "\\|")
+    """Plain text in Markdown, in one line, also within a table; no-break spaces stay.
+
+    Neither tags nor links nor images are made of it.
+    """
+    line = _SPACE.sub(" ", visible(text)).strip().replace("\\", "\\\\")
+    return html.escape(_LINK.sub(_escaped, line), quote=False).replace("|", "\\|")
+
+
+def _escaped(found: re.Match[str]) -> str:
+    """A sign of Markdown as text."""
+    sign = found[0]
+    return f"{sign}\\" if sign == "]" else f"\\{sign}"
 
 
 def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -56,9 +85,24 @@ def markdown_table(head: Sequence[str], rules: Sequence[str], rows: Iterable[Seq
 
 def script_json(value: Any) -> str:
     """JSON that can stand in a script element: nothing in it ends the element or begins a comment."""
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).translate(_IN_SCRIPT)
+    text = json.dumps(_visible_data(value), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return text.translate(_IN_SCRIPT)
+
+
+def _visible_data(value: Any) -> Any:
+    """Plain data whose texts are visible."""
+    if isinstance(value, str):
+        return visible(value)
+    if isinstance(value, dict):
+        return {key: _visible_data(part) for key, part in value.items()}
+    return [_visible_data(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def template_value(value: Any) -> Any:
+    """What a template puts into a page: plain text is made visible; HTML that a template made is a type of its own."""
+    return visible(value) if type(value) is str else value
 
 
 def chart_text(text: str) -> str:
     """Plain text in a chart, whose texts are HTML."""
-    return html.escape(text, quote=False)
+    return html.escape(visible(text), quote=False)

@@ -96,8 +96,8 @@ def show_progress(console: Console, totals: Mapping[str, int], transient: bool =
     if not console.is_terminal:
         yield _lines(console, totals)
         return
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    noted = TimeRemainingColumn(), TextColumn("{task.fields[note]}")
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    noted = TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False)
     with Progress(*columns, *noted, console=console, transient=transient) as bar:
         tasks = [bar.add_task(name, total=total, start=False, note="") for name, total in totals.items()]
 

@@ -1,0 +1,53 @@
+"""The terminal: whatever a text holds, nothing of it is a command."""
+
+import traceback
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
+from train.runs.escaping import visible
+
+
+class PlainConsole(Console):
+    """Rich's console that shows the commands of a terminal within texts, in place of obeying them.
+
+    Texts may come from elsewhere: labels, paths, joints of a model, configurations of a folder that was received. A
+    text that is printed is no markup of Rich's either, unless `markup=True` asks for it.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(emoji=False, **options)  # a policy of the user may be called mine:zero
+
+    def print(self, *objects: Any, markup: bool | None = None, **options: Any) -> None:
+        """See `Console`."""
+        highlight = options.get("highlight")
+        parts = [
+            self.render_str(part, markup=markup is True, highlight=highlight) if isinstance(part, str) else part
+            for part in objects
+        ]
+        super().print(*parts, **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """See `Console`; the texts are visible, and what Rich itself asks of the terminal stays."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(visible(segment.text), segment.style)
+
+
+def traceback_of(error: BaseException) -> str:
+    """The traceback of an error as text for a terminal."""
+    return visible("".join(traceback.format_exception(error)))
+
+
+@contextmanager
+def visible_warnings() -> Iterator[None]:
+    """Warnings within are shown without commands of a terminal."""
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda *given: visible(before(*given))
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
