@@ -26,6 +26,8 @@ _COMMANDS = re.compile(
 )
 _LINK = re.compile(r"\](?=[(\[:])|(?<=http):(?=//)|(?<=https):(?=//)|(?<=ftp):(?=//)|(?<=www)\.", re.IGNORECASE)
 """Signs of Markdown without which a text is no link and no image."""
+_BACKSLASH = re.compile(r"\\(?=[!-/:-@[-`{-~])")
+"""A backslash that Markdown would take away, with what is behind it."""
 _IN_SCRIPT = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"}
 
 
@@ -67,7 +69,8 @@ def markdown_text(text: str) -> str:
 
     Neither tags nor links nor images are made of it.
     """
-    line = _SPACE.sub(" ", visible(text)).strip().replace("\\", "\\\\")
+    line = _SPACE.sub(" ", visible(text)).strip()
+    line = _BACKSLASH.sub(r"\\\\", line)
     return html.escape(_LINK.sub(_escaped, line), quote=False).replace("|", "\\|")
 
 
