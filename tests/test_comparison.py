@@ -305,6 +305,15 @@ def only(rows: Sequence[Change], policy: str = "learned") -> Change:
     return next(row for row in rows if row.policy == policy)
 
 
+def test_a_pattern_does_not_search_the_disk() -> None:
+    """Catches a configuration that has all folders of a computer read, and one whose name is too long for a folder."""
+    with pytest.raises(ConfigurationError, match="stands for one part of a path"):
+        expand([PolicySpec(name="residual:/**/last")])
+    for name in ("a" * 300 + "/*", "a" * 900):
+        with pytest.raises(ConfigurationError, match=r"no folder matches|no residual at"):
+            expand([PolicySpec(name=f"residual:{name}")])
+
+
 def test_change_of_a_family_is_paired_per_training_seed() -> None:
     """Catches a mean over seeds before the ratio, the wrong base, and lost falls."""
     base = cell("base", {"all": [2.0, 4.0, None]}, "soft")

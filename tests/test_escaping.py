@@ -121,7 +121,8 @@ def test_files_obey_no_text(tmp_path: Path) -> None:
 
 
 LINKS = [
-    r"a \ b", r"a\\", r"\*", "[a](http://x)", "![a](http://x/y.png)", "![a][b]", "[a][b]", "[a]: http://x", "http://x.y", "HTTPS://x.y",
+    r"a \ b", r"a\\", r"\*",
+    "[a](http://x)", "![a](http://x/y.png)", "![a][b]", "[a][b]", "[a]: http://x", "http://x.y", "HTTPS://x.y",
     "www.x.org", "ftp://x.y", "\\[a](x)", "[a\\](x)", "[a](<x>)", "<http://x>", "![](x)", "[![a](b)](c)",
 ]  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -563,6 +564,31 @@ def test_weights_that_were_changed_are_refused(tmp_path: Path) -> None:
     save_file(load_file(path / "weights.safetensors") | {"bias1": np.ones(1)}, path / "weights.safetensors")
     with pytest.raises(ConfigurationError, match=r"weights\.safetensors was changed: residual\.json names the SHA-256"):
         baselines.make(f"residual:{path}", scalar("testbed"))
+
+
+@pytest.mark.parametrize("file", ["residual.json", "weights.safetensors"])
+@pytest.mark.parametrize("kind", ["pipe", "huge", "device", "link", "folder"])
+def test_a_residual_consists_of_plain_files_of_its_own(kind: str, file: str, tmp_path: Path) -> None:
+    """Catches 3 GB that are read to be refused, a pipe that is waited for, and a file of somebody else's."""
+    path = folder(tmp_path / "r")
+    (path / file).rename(tmp_path / "elsewhere")
+    {
+        "pipe": lambda: os.mkfifo(path / file),
+        "huge": lambda: ((path / file).touch(), os.truncate(path / file, 3_000_000_000)),
+        "device": lambda: (path / file).symlink_to("/dev/zero"),
+        "link": lambda: (path / file).symlink_to(tmp_path / "elsewhere"),
+        "folder": lambda: (path / file).mkdir(),
+    }[kind]()
+    said = {"pipe": "must be a plain file", "huge": "must have at most", "folder": "Is a directory"}
+    with pytest.raises(ConfigurationError, match=said.get(kind, "is a link out of its folder; copy the file there")):
+        load_residual(path)
+
+
+def test_a_residual_may_lie_behind_a_link(tmp_path: Path) -> None:
+    """Catches a refusal of runs/latest/seed_0/last."""
+    path = folder(tmp_path / "r")
+    (tmp_path / "latest").symlink_to(path)
+    assert load_residual(tmp_path / "latest")[0] == load_residual(path)[0]
 
 
 @pytest.mark.parametrize("name", shipped())

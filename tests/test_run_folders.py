@@ -199,6 +199,25 @@ def test_a_run_with_a_link_out_of_it_is_not_gone_on_with(place: str, tmp_path: P
     assert mine.read_text() == "name: x\n"
 
 
+def test_a_run_with_a_pipe_is_not_gone_on_with(tmp_path: Path) -> None:
+    """Catches a checkpoint, a table or a cell that is waited for."""
+    (tmp_path / "seed_0").mkdir()
+    os.mkfifo(tmp_path / "seed_0" / "progress.csv")
+    (tmp_path / "config.yaml").write_text("name: x\n")
+    with pytest.raises(ConfigurationError, match=r"progress\.csv is neither a file nor a folder"):
+        resume([tmp_path], Console(quiet=True))
+
+
+@pytest.mark.parametrize("text", ["", "decisions,scenario\n", "\0", "decisions\nx\n", "[" * 9000])
+def test_a_broken_table_of_a_training_is_one_sentence(text: str, tmp_path: Path) -> None:
+    """Catches a traceback where the seeds of a run are complete and their table is not."""
+    (tmp_path / "seed_0" / "last").mkdir(parents=True)
+    (tmp_path / "seed_0" / "progress.csv").write_text(text)
+    (tmp_path / "config.yaml").write_text("name: x\n")
+    with pytest.raises(ConfigurationError, match=r"progress\.csv (must be the table of a training|has no evaluations)"):
+        resume([tmp_path], Console(quiet=True))
+
+
 def test_a_run_may_be_a_link_and_have_links_to_itself(tmp_path: Path) -> None:
     """Catches a refusal of runs/latest, and of a best policy that is a link to one of the run's own."""
     (tmp_path / "run").mkdir()

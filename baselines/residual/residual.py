@@ -21,7 +21,7 @@ from baselines.residual.network import Network, Tensors
 from baselines.residual.residual_kernels import count_due, count_step
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
@@ -212,15 +212,18 @@ def read_description(folder: Path) -> ResidualDescription:
 
 def _none_at(folder: Path, why: str) -> str:
     """What to do where no residual is, in a sentence."""
-    inside = [path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")]
+    try:
+        inside = [path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")]
+    except OSError:  # a name that is too long, or a folder that cannot be read
+        inside = []
     if inside:
         inside.sort(key=lambda path: (path.name != "last", path))  # the last policy, for the best one flatters itself
         return f"{folder} is no residual but has some inside; give one of them: {', '.join(map(str, inside))}"
     families = {name: [at.partition("/")[2] for at in own] for name, own in groupby(shipped(), _family)}
     names = ", ".join(f"{name}/{own[0]} to {own[-1]}" for name, own in families.items())
     return (
-        f"no residual at {folder}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({why}), or the name of one "
-        f"that comes with the package: {names}"
+        f"no residual at {shown(str(folder))[1:-1]}: a folder with {DESCRIPTION} and {WEIGHTS} is needed ({why}), "
+        f"or the name of one that comes with the package: {names}"
     )
 
 

@@ -78,7 +78,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
         fresh.rename(path)
     except BaseException as error:
         fresh.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:
+        if isinstance(error, OSError):
             error.filename = str(path)
         raise
     flush(path.parent)

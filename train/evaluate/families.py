@@ -5,6 +5,7 @@ A residual is compared with its base, and with the best policy without learning 
 
 import difflib
 import fnmatch
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from typing import Any
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
 from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
 
@@ -125,16 +126,29 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
     """Folders of a pattern in natural order, with training seed and description; shipped ones where none lie there."""
     is_family, folders = bool(_WILD.search(pattern)), [Path(pattern)]
     if is_family:
-        anchor = Path(pattern).anchor
-        found = [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
-        folders = sorted(found or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
+        folders = sorted(_matching(pattern) or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
         if not folders:
-            raise ConfigurationError(f"no folder matches {pattern!r}; {_nearest(Path(pattern))}")
+            raise ConfigurationError(f"no folder matches {shown(pattern)}; {_nearest(Path(pattern))}")
     descriptions = [read_description(folder) for folder in folders]
     members = [(f, _training_seed(f, said), said) for f, said in zip(folders, descriptions, strict=True)]
     if is_family:
         _require_one_family(pattern, members)
     return members
+
+
+def _matching(pattern: str) -> list[Path]:
+    """Folders whose paths match a pattern.
+
+    Raises:
+        ConfigurationError: The pattern stands for folders of any depth, which may be all of the disk.
+    """
+    if "**" in pattern:
+        raise ConfigurationError(f"* stands for one part of a path, got {shown(pattern)}; leave ** out")
+    anchor = Path(pattern).anchor
+    try:
+        return [path for path in Path(anchor).glob(str(Path(pattern).relative_to(anchor))) if path.is_dir()]
+    except OSError:  # a name that is too long
+        return []
 
 
 def _require_motion(folder: Path, description: ResidualDescription) -> None:
@@ -150,7 +164,7 @@ def _require_motion(folder: Path, description: ResidualDescription) -> None:
 
 def _nearest(pattern: Path) -> str:
     """What lies where the folders of a pattern end to exist, the most similar names first, and what is shipped."""
-    there = next(path for path in pattern.parents if path.is_dir() and not _WILD.search(str(path)))
+    there = next(path for path in pattern.parents if os.path.isdir(path) and not _WILD.search(str(path)))  # noqa: PTH112
     names = [path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")]
     near = difflib.get_close_matches(pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0)
     families = dict.fromkeys(f"{name.split('/')[0]}/seed_*" for name in shipped())

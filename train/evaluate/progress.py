@@ -14,7 +14,8 @@ from elastic_env.core.signals import Array
 from train.evaluate.environments import Column
 
 PROGRESS = "progress.csv"
-_MOST_BYTES = 20_000_000
+MOST_BYTES = 20_000_000
+"""Bytes of the table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ def read_progress(folder: Path, metrics: Sequence[str]) -> list[dict[str, Any]]:
     """
     path = folder / PROGRESS
     try:
-        text = read_bounded(path, _MOST_BYTES).decode("utf-8")
+        text = read_bounded(path, MOST_BYTES).decode("utf-8")
         rows = [_evaluation(row, metrics) for row in csv.DictReader(text.splitlines())]
     except ConfigurationError:
         raise

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from elastic_env.core.config import Locator, Model, load_yaml, quantity
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 
 ENDINGS = (".yaml", ".yml")
 """Of files of robots."""
@@ -51,7 +51,7 @@ def read_robot_file(name: str) -> dict[str, Any]:
         return load_yaml(name, RobotFile).arguments(Path(name).parent)
     except ConfigurationError as error:
         raise ConfigurationError(
-            f"--env {name} must be a file of a robot, with the keys model and joints: {error}"
+            f"--env {shown(name)[1:-1]} must be a file of a robot, with the keys model and joints: {error}"
         ) from None
 
 

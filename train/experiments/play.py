@@ -92,7 +92,7 @@ def _window(episode: Iterator[int], period: float) -> None:
 
 
 def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console) -> None:
-    if video.exists():
+    if video.exists() or video.is_symlink():
         raise ResultsExistError(f"{video} exists and is not overwritten; name another file")
     if video.suffix not in {".mp4", ".gif"}:
         raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.files import flush
+from elastic_env.core.files import flush, read_bounded
+from elastic_env.core.json_text import LARGEST_JSON
 
 _DIGESTS = "sha256.json"
 
@@ -55,7 +56,7 @@ def require_whole(checkpoint: Path) -> None:
         ElasticError: One is missing, of another content, or not of this checkpoint.
     """
     try:
-        digests = json.loads((checkpoint / _DIGESTS).read_text(encoding="utf-8"))
+        digests = json.loads(read_bounded(checkpoint / _DIGESTS, LARGEST_JSON))
         found = {file.name: _digest(file) for file in checkpoint.iterdir() if file.name != _DIGESTS}
     except (OSError, ValueError, RecursionError) as error:
         raise damaged(checkpoint, f"{_DIGESTS}: {error}") from None

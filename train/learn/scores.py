@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from baselines.residual.residual import ResidualDescription, save_residual
-from elastic_env.core.files import write_whole
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.files import read_bounded, write_whole
 from elastic_env.core.signals import Array, BoolArray
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import make_policy
-from train.evaluate.progress import PROGRESS
+from train.evaluate.progress import MOST_BYTES, PROGRESS
 from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
@@ -77,8 +78,11 @@ class Scores:
     def forget_after(self, decisions: int) -> None:
         """Drop evaluations that were made after the checkpoint that is gone on with; they will be made again."""
         path = self._folder / PROGRESS
-        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-        kept = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",")[0]) <= decisions]
+        lines = _text_of(path).splitlines(keepends=True)
+        try:
+            kept = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",")[0]) <= decisions]
+        except ValueError as error:
+            raise ConfigurationError(f"{path} is no table of evaluations ({error}); remove it") from None
         if decisions == 0 or not lines:
             path.unlink(missing_ok=True)
             return
@@ -100,8 +104,21 @@ def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:
     if not path.exists():
         writer.writerow(header)
     writer.writerows(rows)
-    before = path.read_text(encoding="utf-8") if path.exists() else ""
-    write_whole(path, before + text.getvalue())
+    write_whole(path, _text_of(path) + text.getvalue())
+
+
+def _text_of(path: Path) -> str:
+    """Text of a table; empty where there is none.
+
+    Raises:
+        ConfigurationError: It is no text, no plain file, or too large.
+    """
+    try:
+        return read_bounded(path, MOST_BYTES).decode("utf-8")
+    except FileNotFoundError:
+        return ""
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path} is no table of evaluations ({error}); remove it") from None
 
 
 def played_together(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.residual.residual import ResidualDescription
-from train.learn.checkpoint import recovered, require_whole, written
+from train.learn.checkpoint import damaged, recovered, require_whole, written
 from train.learn.scores import Scores
 from train.learn.train_config import TrainConfig
 
@@ -63,7 +63,10 @@ class Trainer(ABC):
         path = self.folder / CHECKPOINT
         if recovered(path):
             require_whole(path)
-            self._read(path)
+            try:
+                self._read(path)
+            except (KeyError, IndexError, TypeError, ValueError, RecursionError, RuntimeError) as error:
+                raise damaged(path, f"{type(error).__name__}: {error}") from error
         self._scores.forget_after(self.done)
 
     @abstractmethod

@@ -82,7 +82,8 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
         writer: Who made such a folder, in words.
 
     Raises:
-        ConfigurationError: The folder has no configuration, or something in it is a link that leads out of it.
+        ConfigurationError: The folder has no configuration, or something in it is a link that leads out of it, or
+            neither a file nor a folder.
     """
     file = folder / CONFIG
     if not file.is_file():
@@ -90,10 +91,13 @@ def require_run(folder: Path, what: str, writer: str) -> Path:
     for place, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = Path(place, name)
-            if path.is_symlink() and leads_out(path, folder):
+            kind = path.lstat().st_mode
+            if stat.S_ISLNK(kind) and leads_out(path, folder):
                 raise ConfigurationError(
                     f"{path} is a link that leads out of {folder}, where nothing is to be changed; remove it"
                 )
+            if not (stat.S_ISLNK(kind) or stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+                raise ConfigurationError(f"{path} is neither a file nor a folder, as all of a run are; remove it")
     return file
 
 
