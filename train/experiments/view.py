@@ -24,7 +24,7 @@ from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import make_policy
-from train.experiments.play import episode
+from train.experiments.play import episode, steps_within
 from train.experiments.view_proxy import LOOPBACK, Access, Proxy, listen
 
 FIRST_FACTOR, LARGEST_FACTOR = 3.0, 20.0
@@ -86,15 +86,15 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
         max_s: Stop after this much simulated time [s].
 
     Raises:
-        ElasticError: The picture of the robot cannot be drawn side by side.
+        ElasticError: The picture of the robot cannot be drawn side by side, or `max_s` is no time.
     """
     env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
-    steps = task.num_steps if max_s is None else min(max(round(max_s / period), 1), task.num_steps)
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     times_s, frames = [], []
     with contextlib.closing(env):
+        steps = steps_within(task, max_s)
         picture = env.unwrapped.picture
         if not hasattr(picture, "sides"):
             raise ElasticError(
