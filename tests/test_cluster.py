@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from train.learn.run_training import start
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
 from train.workers.calls import Watch, WorkerKilledError, run_calls
+from train.workers.dask_cluster import warn_of_public
 from train.workers.places import Place
 from train.workers.versions import VersionsDifferError, require_same
 
@@ -300,3 +302,14 @@ def test_a_training_seed_whose_worker_is_killed_ends_with_the_same_weights(
     Training(config, 3, tmp_path / "alone").run()
     for name, tensor in weights(tmp_path / "alone" / "last").items():
         np.testing.assert_array_equal(tensor, weights(own / "last")[name], err_msg=name)
+
+
+def test_a_scheduler_at_a_public_address_gets_a_warning() -> None:
+    """Catches a scheduler on the Internet, which runs the code of whoever reaches it, without a word."""
+    for address in ("8.8.8.8:8786", "[2001:4860:4860::8888]:8786"):
+        with pytest.warns(UserWarning, match="public address, by plain TCP: whoever reaches it runs code"):
+            warn_of_public(address)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for address in ("127.0.0.1:8786", "10.1.2.3:8786", "192.168.0.7:8786", "[::1]:8786", "no.such.invalid:1"):
+            warn_of_public(address)

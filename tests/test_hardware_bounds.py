@@ -8,7 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from elastic_env.core.config import Model
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.imu import attitude
 from elastic_env.hardware.imu.attitude import AttitudeError, AttitudeStream
@@ -17,9 +21,12 @@ from elastic_env.hardware.safety import supervisor
 from elastic_env.hardware.safety.bounds import exceeds, is_outside
 from elastic_env.hardware.safety.limits import Guard, SafetyLimits
 from elastic_env.hardware.safety.realtime import Pace
+from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.robots.testbed.model import Pendulum
 from tests.test_hardware_safety import states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import StillBus, make_still, still  # noqa: F401  a fixture
+from train.hardware.session import emulate
 
 NO_NUMBERS = [math.nan, math.inf, -math.inf]
 no_number = pytest.mark.parametrize("value", NO_NUMBERS)
@@ -232,3 +239,46 @@ def test_the_first_cycle_that_sees_it_stops_the_motion(
 def _step(env: Any, times: int) -> None:
     for _ in range(times):
         env.step(np.zeros(1, dtype=np.float32))
+
+
+TINY, HUGE = 5e-324, 1e39
+ALLOWED_NEAR_ZERO = ("lowest_rad", "highest_rad", "margin_rad", "patience_cycles")
+LIMITS = [(name, info) for name, info in SafetyLimits.model_fields.items() if name not in ALLOWED_NEAR_ZERO]
+SETTINGS = {
+    "baudrate": "[bit/s]", "imu_baudrate": "[bit/s]", "imu_oldest_s": "[s]", "largest_deflection_rad": "[rad]",
+    "approach_rad_s": "[rad/s]",
+}  # fmt: skip
+LOADS = {"gravity_torque": "[N·m]", "mass": "[kg]", "gyration_radius": "[m]"}
+
+
+@pytest.mark.parametrize("value", [TINY, 1e-12, -1.0, 0.0, HUGE, *NO_NUMBERS])
+@pytest.mark.parametrize(
+    ("model", "name", "unit"),
+    [
+        *((SafetyLimits, name, f"[{info.json_schema_extra['unit']}]") for name, info in LIMITS),  # type: ignore[index]
+        *((HardwareSettings, name, unit) for name, unit in SETTINGS.items()),
+        *((Pendulum, name, unit) for name, unit in LOADS.items()),
+        (EmulatorConfig, "imu_rate_hz", "[Hz]"),
+        (EmulatorConfig, "baudrate", "[bit/s]"),
+    ],
+)
+def test_no_setting_takes_what_no_hardware_has(model: type[Model], name: str, unit: str, value: float) -> None:
+    """Catches a rate of 1e39 bit/s that ends in the SDK, and limits that stop every motion, or none."""
+    others = {"port": "/dev/ttyNOTHING"} if model is HardwareSettings else {}
+    with pytest.raises(ConfigurationError, match=name) as refused:
+        model(**{name: value, **others})
+    assert unit in str(refused.value) or "whole number" in str(refused.value)
+    assert len(str(refused.value)) < 400
+
+
+def test_a_range_of_goals_is_more_than_a_rounding_error() -> None:
+    """Catches a range in which no servo can stay."""
+    with pytest.raises(ConfigurationError, match=r"by at least 0\.01 rad"):
+        SafetyLimits(lowest_rad=0.1, highest_rad=math.nextafter(0.1, 1.0))
+
+
+@pytest.mark.parametrize("after_s", [-1.0, 1e39, *NO_NUMBERS])
+def test_a_fault_comes_at_a_time_that_one_can_wait_for(after_s: float) -> None:
+    """Catches a traceback of the clock."""
+    with pytest.raises(ConfigurationError, match="--fault-after-s must be from 0 to 86400 s"):
+        emulate(EmulatorConfig(), Console(quiet=True), {"hot": True}, after_s)

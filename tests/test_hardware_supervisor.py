@@ -1,11 +1,15 @@
 """The supervisor in this process, on emulated servos without terminals: faults at the very moment that matters."""
 
 import itertools
+import os
 import re
 import signal
 import socket
+import subprocess
+import time
 from collections import deque
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +20,7 @@ from elastic_env.hardware.emulator.wire import EmulatedBus
 from elastic_env.hardware.errors import BusGoneError, ReplyError
 from elastic_env.hardware.safety import supervised, supervisor
 from elastic_env.hardware.safety.channel import Channel
+from elastic_env.hardware.safety.ending import is_ending
 from elastic_env.hardware.safety.limits import SafetyLimits
 from elastic_env.hardware.safety.supervised import emergency_stop
 from elastic_env.hardware.safety.supervisor import Supervisor
@@ -112,7 +117,7 @@ def served(lines: list[Line], *requests: tuple[str, dict[str, Any]]) -> list[dic
         program.send({"number": number, "do": action, "with": arguments})
     own.shutdown(socket.SHUT_WR)
     try:
-        Supervisor(Channel(other), list(lines)).run()
+        Supervisor(Channel(other), list(lines), os.getpid()).run()
     finally:
         other.close()
     answers = iter(program.receive, None)
@@ -282,3 +287,48 @@ def test_an_error_number_that_nobody_knows_is_no_success() -> None:
     line.attach_known({1: 54024})
     with pytest.raises(ReplyError, match="refuses: error 9"):
         line.write(1, "torque_enable", 0)
+
+
+def test_a_program_that_was_killed_and_still_has_its_channel_loses_torque_at_once() -> None:
+    """Catches a supervisor that waits for a busy computer to close what a dead program had open."""
+    line = attached("/dev/ttyA", 1)
+    own, other = Channel.pair()
+    Channel(own).send({"number": 1, "do": ENABLE[0], "with": ENABLE[1]})
+    with subprocess.Popen(["true"]) as program:  # it has ended, and nobody has asked how
+        while not is_ending(program.pid):
+            time.sleep(0.001)
+        Supervisor(Channel(other), [line], program.pid).run()  # which waits for ever, as `own` is open
+    own.close()
+    other.close()
+    assert line.events[-1] == (1, "torque_enable", 0)
+
+
+STATUS = "Name:\tx\nSigPnd:\t0000000000000000\nShdPnd:\t{}\n"
+STAT = "7 (a) b c) {} 1 7 7 0 -1 {} 0 0\n"
+
+
+@pytest.mark.parametrize(
+    ("pending", "state", "flags", "expected"),
+    [
+        ("0" * 16, "S", 0x400000, False),
+        ("0000000000004000", "S", 0x400000, False),  # SIGTERM, which it may ignore
+        ("0000000000000100", "S", 0x400000, True),
+        ("0" * 16, "R", 0x400004, True),
+        ("0" * 16, "D", 0x400200, True),
+        ("0" * 16, "Z", 0x400000, True),
+    ],
+)
+def test_linux_tells_that_a_program_ends(pending: str, state: str, flags: int, expected: bool, tmp_path: Path) -> None:
+    """Catches a signal, a state or a flag that is read from the wrong place."""
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7" / "status").write_text(STATUS.format(pending))
+    (tmp_path / "7" / "stat").write_text(STAT.format(state, flags))
+    assert is_ending(7, tmp_path) == expected
+
+
+def test_a_program_that_lives_does_not_end_and_one_that_is_gone_has_ended(tmp_path: Path) -> None:
+    """Catches a supervisor that stops every motion, also where the system tells nothing."""
+    assert not is_ending(os.getpid())
+    assert not is_ending(7, tmp_path)
+    (tmp_path / "self").mkdir()
+    assert is_ending(7, tmp_path)

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -566,6 +567,53 @@ def test_help_teaches(arguments: list[str], words: list[str], capsys: pytest.Cap
     printed = capsys.readouterr().out
     assert caught.value.code == 0
     assert [word for word in words if word not in printed] == []
+
+
+COMMANDS = (
+    "identify",
+    "evaluate",
+    "compare",
+    "train",
+    "iterate",
+    "export",
+    "bench",
+    "speed",
+    "play",
+    "view",
+    "robot",
+    "demo",
+)
+OF_HARDWARE = ("scan", "check", "run", "emulate")
+
+
+@pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("hardware", name) for name in OF_HARDWARE)])
+def test_every_command_has_help_and_refuses_what_it_does_not_know(
+    command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a command whose help fails, and an error that ends as bench's "worse"."""
+    with pytest.raises(SystemExit) as caught:
+        main([*command, "--help"])
+    assert caught.value.code == 0
+    assert f"elastic {' '.join(command)}" in capsys.readouterr().out
+    assert refused([*command, "--no-such-option"], capsys)
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--version"])
+    assert not caught.value.code
+    assert capsys.readouterr().out == f"elastic-env {metadata.version('elastic-env')}\n"
+
+
+def test_output_that_nobody_reads_ends_as_by_sigpipe() -> None:
+    """Catches a closed pipe that ends with 1, which is bench's "worse": rich ends the program so by itself."""
+    elastic = str(Path(sys.executable).with_name("elastic"))
+    short = "{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}"
+    for command in (f"{elastic} --help", f"{elastic} evaluate --reference '{short}'"):
+        script = f"{command} | true; echo ${{PIPESTATUS[0]}}"
+        run = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=120, check=True)
+        assert run.stdout == "141\n", run.stderr
+        assert "Traceback" not in run.stderr
 
 
 # elastic identify, speed, play, demo.

@@ -1,5 +1,6 @@
 """Policies and wrappers in the user's own files, whatever these are called."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
+from train.runs.import_path import look_last_in
 from train.runs.user_code import named_object
 
+ROOT = Path(__file__).resolve().parents[1]
 TRAIN = """
 import gymnasium
 import elastic_env
@@ -47,3 +50,78 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigurationError, match=said):
             named_object(name)
+
+
+STANDARD = ("multiprocessing", "subprocess", "weakref", "random", "numpy")
+"""Modules that every process imports, and that would be found in the working folder first."""
+MINE = """
+import baselines
+import helper
+
+def policy(env):
+    return baselines.make(helper.NAME, env)
+"""
+CONFIG = """
+name: mine
+policies: [{name: "mine.py:policy", label: by file}, {name: "own:policy", label: by module}]
+references: [{kind: sine, duration_s: 0.5, onset_s: 0.5, amplitude: 0.1}]
+"""
+
+
+def plant(folder: Path) -> Path:
+    """Lay modules into a folder that leave their names in a file when they are imported; that file."""
+    said = folder / "imported"
+    for name in (*STANDARD, "train", "baselines", "elastic_env"):
+        (folder / f"{name}.py").write_text(f"open({str(said)!r}, 'a').write('{name} ')\n")
+    return said
+
+
+def elastic(folder: Path, *arguments: str, **more: str) -> "subprocess.CompletedProcess[str]":
+    """Run the console script in a folder, with further variables of the environment."""
+    command = [str(Path(sys.executable).with_name("elastic")), *arguments]
+    known = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return subprocess.run(command, cwd=folder, env={**known, **more}, capture_output=True, text=True, check=False)
+
+
+def test_nothing_of_the_working_folder_stands_before_what_is_installed(tmp_path: Path) -> None:
+    """Catches workers that import a user's multiprocessing.py, and a baselines.py that breaks every command."""
+    said = plant(tmp_path)
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "own.py").write_text(MINE)
+    (tmp_path / "helper.py").write_text("NAME = 'input'\n")
+    (tmp_path / "mine.yaml").write_text(CONFIG)
+    run = elastic(tmp_path, "compare", "mine.yaml", "--jobs", "2", COLUMNS="200")
+    assert run.returncode == 0, run.stderr
+    assert not said.exists(), said.read_text()
+
+
+def test_a_file_that_stands_before_a_package_is_named(tmp_path: Path) -> None:
+    """Catches "a defect of elastic-env" where a folder of PYTHONPATH has a baselines.py."""
+    (tmp_path / "baselines.py").write_text("")
+    (tmp_path / "work").mkdir()
+    run = elastic(tmp_path / "work", "evaluate", "--help", PYTHONPATH=str(tmp_path))
+    assert run.returncode == 2
+    assert run.stderr.startswith(f"error: {tmp_path / 'baselines.py'} stands in the place of the package baselines")
+    assert len(run.stderr.splitlines()) == 1
+
+
+def test_the_path_keeps_its_order_but_for_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a path that loses entries or has the folder twice, first, or before our packages."""
+    monkeypatch.chdir(tmp_path)
+    others = [entry for entry in sys.path if entry and Path(entry).resolve() != tmp_path]
+    for first in ("", ".", str(tmp_path)):
+        monkeypatch.setattr(sys, "path", [first, *others])
+        look_last_in(tmp_path)
+        look_last_in(tmp_path)
+        assert sys.path[-1] == str(tmp_path)
+        assert [entry for entry in sys.path if entry in others] == others
+        assert sys.path.count(str(tmp_path)) == 1
+        assert str(ROOT) in sys.path
+
+
+def test_a_module_that_stands_before_the_users_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches "train has no 'make'" for a user whose train.py has one."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "train.py").write_text("def make(env):\n    return 42\n")
+    with pytest.raises(ConfigurationError, match=r"stands before your train\.py; name the file itself: train\.py:make"):
+        named_object("train:make")

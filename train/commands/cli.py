@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import tyro
 from rich.text import Text
 
+import elastic_env
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
@@ -21,6 +22,7 @@ from train.commands.options import CONSOLE
 from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, Robot, View
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.failures import DEFECT, EndedError, explained
+from train.runs.import_path import look_last_in
 from train.runs.progress import say_what_is_compiled
 
 Command = (
@@ -85,19 +87,22 @@ def _ended_by(*numbers: int) -> Iterator[None]:
 
 
 def _command(arguments: list[str] | None) -> Any:
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        print(f"elastic-env {elastic_env.__version__}")
+        sys.exit()
     return tyro.cli(
         Command, prog="elastic", args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
-        description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each.",
+        description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each, "
+        "`elastic --version` says which version this is.",
     )  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the command `elastic`."""
-    if "" not in sys.path and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))  # as with python -m, for --policy module:function
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
+            look_last_in(Path.cwd())  # for --policy module:function
             command = _command(arguments)
             with say_what_is_compiled(CONSOLE), visible_warnings():
                 command.run()

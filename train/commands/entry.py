@@ -2,10 +2,15 @@
 
 import contextlib
 import os
+import signal
 import sys
+from pathlib import Path
 
 from train.runs.escaping import visible
-from train.runs.failures import SYSTEM_FAILED, explained, is_interrupt
+from train.runs.failures import SYSTEM_FAILED, WRONG_INPUT, explained, is_interrupt, is_unread
+from train.runs.import_path import ShadowedError, look_last_in, safe_children
+
+_UNREAD = 128 + signal.SIGPIPE
 
 
 def main() -> None:
@@ -13,11 +18,20 @@ def main() -> None:
     _have_streams()
     try:
         try:
+            _leave_working_folder()  # before anything else is imported
             from train.commands.cli import main as run
 
-            run()
+            with safe_children():
+                run()
         finally:
             sys.stdout.flush()
+    except ShadowedError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(WRONG_INPUT)
+    except SystemExit as error:
+        if is_unread(error):  # the console of rich ends the program with 1 by itself
+            _end_without_output(BrokenPipeError())
+        raise
     except (KeyboardInterrupt, ImportError) as error:
         if not is_interrupt(error):
             raise
@@ -25,6 +39,17 @@ def main() -> None:
         os._exit(130)
     except OSError as error:
         _end_without_output(error)
+
+
+def _leave_working_folder() -> None:
+    """Import nothing from the working folder that is installed, here and in the processes that are started."""
+    look_last_in(Path.cwd())
+    from elastic_env.hardware.safety.child_process import child_environment
+
+    kept = child_environment()
+    if "PYTHONPATH" not in kept:
+        os.environ.pop("PYTHONPATH", None)
+    os.environ.update(kept)
 
 
 def _have_streams() -> None:
@@ -36,7 +61,8 @@ def _have_streams() -> None:
 
 def _end_without_output(error: OSError) -> None:
     """End where nobody reads any more, or the disk that the output goes to is full; that is said, if it can be."""
-    if not isinstance(error, BrokenPipeError):
+    is_closed = isinstance(error, BrokenPipeError)
+    if not is_closed:
         said, _ = explained(error) or (str(error), SYSTEM_FAILED)
         with contextlib.suppress(OSError):
             sys.stderr.write(visible(f"error: {said}\n"))
@@ -45,7 +71,7 @@ def _end_without_output(error: OSError) -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nowhere, stream)
-    sys.exit(SYSTEM_FAILED)
+    sys.exit(_UNREAD if is_closed else SYSTEM_FAILED)
 
 
 if __name__ == "__main__":

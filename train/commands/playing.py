@@ -292,8 +292,8 @@ class View:
     """Look at one episode in the browser: reference, motor side and link side of the robot, side by side.
 
     The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C. Sliders set the time,
-    and the factor by which deviations from the reference are enlarged. The page is served to whoever reaches the port,
-    without a password.
+    and the factor by which deviations from the reference are enlarged. The page is reached from this machine alone, at
+    the address that is printed, with its token; from elsewhere by: ssh -L 8080:127.0.0.1:8080 MACHINE
 
     Example, one joint: elastic view --policy input --reference sine
 
@@ -310,6 +310,8 @@ class View:
     """Motion, as in elastic evaluate; default sine, on the walker 3."""
     seed: int = 0
     """Seed of the episode."""
+    host: str = "127.0.0.1"
+    """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others reach it too."""
     port: int = 0
     """Port of the page; 0 takes the first free one from 8080 on."""
     max_s: float | None = None
@@ -317,9 +319,9 @@ class View:
 
     def run(self) -> None:
         """Play and show."""
-        from train.experiments.view import view
+        from train.experiments.view import PageOptions, view
 
-        view(_watched(self), CONSOLE, self.port, self.max_s)
+        view(_watched(self), CONSOLE, PageOptions(self.host, self.port, self.max_s))
 
 
 @dataclass

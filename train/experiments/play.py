@@ -32,15 +32,13 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
         ResultsExistError: The video file exists.
         MissingExtraError: The video writer is not installed.
     """
-    if max_s is not None and not max_s > 0.0:
-        raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
     env: Any = gymnasium.make(
         condition.environment.id, render_mode="human" if video is None else "rgb_array", **condition.arguments
     )  # fmt: skip
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
-    steps = task.num_steps if max_s is None else max(round(min(max_s / period, task.num_steps)), 1)
     with closing(env):
+        steps = steps_within(task, max_s)
         policy = make_policy(condition.policy, env)
         if hasattr(policy, "rehearse"):
             _rehearse(policy, condition, console)
@@ -49,6 +47,23 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
             _window(steps_of_it, period)
         else:
             _film(env, steps_of_it, steps, period, video, console)
+
+
+def steps_within(task: Any, max_s: float | None) -> int:
+    """Control steps of an episode that is shown, at least one.
+
+    Args:
+        task: Of the environment.
+        max_s: Stop after this much simulated time [s]; None for the whole episode.
+
+    Raises:
+        ElasticError: That is no time.
+    """
+    if max_s is None:
+        return task.num_steps
+    if not max_s > 0.0:
+        raise ElasticError(f"max_s must be > 0 [s], got {max_s}")
+    return max(round(min(max_s / task.assumed_model.control_period_s, task.num_steps)), 1)
 
 
 def _rehearse(policy: Any, condition: Condition, console: Console) -> None:

@@ -1,15 +1,22 @@
 """An episode in MuJoCo's web viewer: reference, motor side and link side, side by side."""
 
 import bisect
+import contextlib
+import io
+import os
+import socket
+import sys
+import tempfile
+import threading
 import time
-from collections.abc import Sequence
-from contextlib import closing
+import webbrowser
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 import mujoco
-from mujoco.studio import app, launch_web, messages, plugin, viewer_protocol
+from mujoco.studio import app, launch_thread, messages, plugin, viewer_handle, viewer_protocol, web_viewer
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 from rich.console import Console
 
@@ -17,13 +24,16 @@ from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import make_policy
-from train.experiments.play import episode
+from train.experiments.play import episode, steps_within
+from train.experiments.view_proxy import LOOPBACK, Access, Proxy, listen
 
 FIRST_FACTOR, LARGEST_FACTOR = 3.0, 20.0
 """Factors of the slider: the one at the start, and its end."""
 
 _FRAMES_PER_S = 50
 _PAUSE_S = 0.01
+_SHORT = "/tmp"
+"""Where a socket is: its path may have about a hundred characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
 _PLACE, _SIZE = (16.0, 40.0), (400.0, 130.0)
 """Of the window of sliders [pixels]."""
@@ -76,15 +86,15 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
         max_s: Stop after this much simulated time [s].
 
     Raises:
-        ElasticError: The picture of the robot cannot be drawn side by side.
+        ElasticError: The picture of the robot cannot be drawn side by side, or `max_s` is no time.
     """
     env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
-    steps = task.num_steps if max_s is None else min(max(round(max_s / period), 1), task.num_steps)
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     times_s, frames = [], []
-    with closing(env):
+    with contextlib.closing(env):
+        steps = steps_within(task, max_s)
         picture = env.unwrapped.picture
         if not hasattr(picture, "sides"):
             raise ElasticError(
@@ -104,7 +114,15 @@ class _Poses(plugin.SimPlugin):
         self._playback, self._scene = playback, scene
 
     @messages.handler
+    def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
+        """Keep the three robots: no file of a page, nor its button to reload, puts another model in their place."""
+        return True
+
+    @messages.handler
     def _on_step(self, event: messages.StepEvent) -> None:
+        if event.model is not self._scene.model:
+            time.sleep(_PAUSE_S)
+            return
         self._playback.tick()
         event.data.time = self._playback.time_s
         self._scene.pose(event.data, self._playback.recording.at(self._playback.time_s), self._playback.factor)
@@ -129,31 +147,133 @@ class _Sliders(plugin.ViewerPlugin):
         imgui.End()
 
 
-def show(recording: Recording, port: int = 0, open_browser: bool = True) -> Any:
-    """Serve a recording to browsers, in threads of their own; what runs the loop is the handle's `sync`.
+class _PrivateViewer(web_viewer.WebViewer):
+    """MuJoCo's web viewer at a socket of ours, in place of a port that everybody reaches; it takes no models.
+
+    Args:
+        endpoint: To the side that poses the robots.
+        plugins: What the page shows.
+        listener: Where the viewer listens.
+    """
+
+    def __init__(self, endpoint: Any, plugins: list[Any], listener: socket.socket) -> None:
+        self._listener = listener
+        config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=_free_port())
+        with contextlib.redirect_stdout(io.StringIO()):  # the address that it prints is not the page's
+            super().__init__(config, endpoint, plugins=plugins)
+
+    def _start_server(self) -> None:
+        self._http_sock.close()  # it was bound to every address, and has never listened
+        self._http_sock = self._listener
+        super()._start_server()
+
+    def get_drop_file(self) -> str:
+        """No file is taken from the page."""
+        return ""
+
+
+def _free_port() -> int:
+    with socket.create_server(("", 0)) as free:
+        return free.getsockname()[1]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A recording that browsers can see.
+
+    Attributes:
+        handle: What runs the loop, by its `sync`.
+        access: Who may see it, and its address.
+    """
+
+    handle: viewer_handle.ViewerHandle
+    access: Access
+
+
+@contextlib.contextmanager
+def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[Page]:
+    """Serve a recording to browsers, in threads of their own, as long as what is within runs.
 
     Args:
         recording: What is shown, again and again.
+        host: Address or name of this machine at which the page listens.
         port: Port of the page; 0 takes the first free one from 8080 on.
-        open_browser: Whether a tab opens where there is a display.
+
+    Raises:
+        ConfigurationError: Host or port cannot be.
+        SystemFailedError: The port is taken.
     """
+    browsers = listen(host, port)
+    access = Access(host, browsers.getsockname()[1])
+    with contextlib.closing(browsers), tempfile.TemporaryDirectory(prefix="elastic_view_", dir=_SHORT) as folder:
+        place = f"{folder}/viewer"
+        with _launch(recording, place) as handle:
+            proxy = Proxy(browsers, place, access)
+            with contextlib.closing(proxy):
+                yield Page(handle, access)
+
+
+def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
+    """Start the viewer in a thread; it listens on a Unix socket of a path."""
     scene, playback = SideBySide(recording.robot), Playback(recording)
-    config = viewer_protocol.ViewerConfig(title=_TITLE, gfx="web", http_port=port, open_browser=open_browser)
-    handle = launch_web.launch(
-        config,
-        plugins=[
-            app.App(app.Config(show_options=False, show_inspector=False)),
-            _Poses(playback, scene),
-            _Sliders(playback),
-        ],
-    )
+    plugins = [
+        app.App(app.Config(show_options=False, show_inspector=False)),
+        _Poses(playback, scene),
+        _Sliders(playback),
+    ]
+    of_viewer, of_robots = plugin.split_plugins(plugins)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(place)
+    listener.listen()
+    begun = threading.Event()
+
+    def run(endpoint: Any) -> None:
+        try:
+            viewer = _PrivateViewer(endpoint, of_viewer, listener)
+        finally:
+            begun.set()
+        viewer_protocol.run_viewer_loop(viewer)
+
+    handle = launch_thread.launch_thread(run, sim_plugins=of_robots)
+    begun.wait()
     handle.set_model(scene.model, data=mujoco.MjData(scene.model))
     return handle
 
 
-def view(condition: Condition, console: Console, port: int = 0, max_s: float | None = None) -> None:
+@dataclass(frozen=True)
+class PageOptions:
+    """Where and how long a page shows an episode.
+
+    Attributes:
+        host: Address or name of this machine at which it listens.
+        port: Its port; 0 takes the first free one from 8080 on.
+        max_s: How much of the episode it shows [s]; None for all.
+    """
+
+    host: str = LOOPBACK
+    port: int = 0
+    max_s: float | None = None
+
+
+def view(condition: Condition, console: Console, options: PageOptions) -> None:
     """Play an episode, then show it until Ctrl-C."""
+    listen(options.host, options.port).close()  # what cannot be is said before the episode
     console.print(f"playing {condition.policy.title} first", soft_wrap=True)
-    with show(record(condition, console, max_s), port) as handle:
-        while handle.is_running():
-            handle.sync()
+    recording = record(condition, console, options.max_s)
+    with show(recording, options.host, options.port) as page:
+        console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False, markup=False)
+        if not page.access.is_local:
+            console.print(
+                "who has this address sees the page and moves its sliders; nothing on the way is encrypted",
+                soft_wrap=True,
+            )
+        console.print("Ctrl-C ends it", soft_wrap=True)
+        _open_tab(page.access.address)
+        while page.handle.is_running():
+            page.handle.sync()
+
+
+def _open_tab(address: str) -> None:
+    """Open a tab of the browser, where there is a display."""
+    if not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        threading.Thread(target=webbrowser.open, args=(address, 2), daemon=True).start()

@@ -16,7 +16,7 @@ from rich.table import Table
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, load_yaml
-from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.errors import ConfigurationError, require_known, shown
 from elastic_env.hardware.emulator.config import EmulatorConfig
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.emulator.running import RunningEmulator
@@ -33,6 +33,7 @@ from train.evaluate.evaluate import make_policy
 from train.runs.folders import run_folder
 
 _SHOWN_S = 1.0
+_LATEST_FAULT_S = 86_400.0
 _PATIENT_IMU_S = 0.2
 PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
 """The most patient limits there are, for emulators: a busy computer delays pseudo-terminals."""
@@ -84,6 +85,8 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
         baudrate: Bits per second, or None to try the usual rates.
         console: Where the table goes.
     """
+    if baudrate is not None:
+        HardwareSettings(port=port, baudrate=baudrate)  # checks it
     table = Table("bit/s", "id", "model number", "model", "firmware", title=f"servos at {port}")
     number = 0
     for rate in RATES if baudrate is None else (baudrate,):
@@ -105,7 +108,7 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
 
 def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, imu_baudrate: int, console: Console) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
-    HardwareSettings(port=port, imu_port=imu_port)  # which refuses one port for both
+    HardwareSettings(port=port, baudrate=baudrate, imu_port=imu_port, imu_baudrate=imu_baudrate)  # checks them
     require_ids(ids)
     with Bus(port, baudrate) as bus:
         checks = check_bus(bus, ids)
@@ -239,7 +242,12 @@ def emulate(
         console: Where the ports are said.
         later: Faults that come after a while, see `Faults`.
         after_s: When [s].
+
+    Raises:
+        ConfigurationError: That is no time that somebody can wait for.
     """
+    if not 0.0 <= after_s <= _LATEST_FAULT_S:
+        raise ConfigurationError(f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {shown(after_s)}")
     with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
         console.print(f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True)
         console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)

@@ -14,6 +14,8 @@ import ctypes
 import errno
 from collections.abc import Iterator
 
+from train.runs.import_path import ShadowedError
+
 WRONG_INPUT, SYSTEM_FAILED, DEFECT = 2, 3, 70
 
 _EXTRAS = {
@@ -39,6 +41,8 @@ class EndedError(KeyboardInterrupt):
 
 def explained(error: BaseException) -> tuple[str, int] | None:
     """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
+    if isinstance(error, ShadowedError):
+        return str(error), WRONG_INPUT
     from elastic_env.core.errors import ElasticError, missing_extra
 
     if is_interrupt(error):
@@ -66,6 +70,11 @@ def _quotes_interrupt(error: BaseException) -> bool:
     """Whether `ctypes` met Ctrl-C while it converted an argument: its error only quotes the exception."""
     names = (KeyboardInterrupt.__name__, EndedError.__name__)
     return isinstance(error, ctypes.ArgumentError) and any(name in str(error) for name in names)
+
+
+def is_unread(error: BaseException) -> bool:
+    """Whether it comes from a pipe whose reader has gone, such as `head`."""
+    return any(isinstance(cause, BrokenPipeError) for cause in _causes(error))
 
 
 def is_full(error: BaseException) -> bool:

@@ -72,9 +72,20 @@ def named_object(name: str) -> Any:
     except (Exception, SystemExit) as error:
         raise ConfigurationError(f"{place} cannot be imported: {type(error).__name__}: {error}") from error
     if not hasattr(module, attribute):
+        _require_unshadowed(module, attribute)
         own = [f.__name__ for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
         raise ConfigurationError(f"{place} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}")
     return getattr(module, attribute)
+
+
+def _require_unshadowed(module: ModuleType, attribute: str) -> None:
+    """Refuse a module that was meant to be a file of the working folder, which is looked at last."""
+    file = Path(f"{module.__name__.replace('.', '/')}.py")
+    found = getattr(module, "__file__", None)
+    if file.is_file() and (found is None or file.resolve() != Path(found).resolve()):
+        raise ConfigurationError(
+            f"{found or 'a built-in module'} stands before your {file}; name the file itself: {file}:{attribute}"
+        )
 
 
 def _from_path(module: str) -> ModuleType:

@@ -8,7 +8,6 @@ import pickle
 import platform
 import queue
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
+from train.runs.import_path import look_last_in
 from train.workers.versions import VersionsDifferError, everything, require_same
 
 MOST_MOVES = 2
@@ -113,8 +113,7 @@ class Home:
         require_same(self.versions, everything(), platform.node())
         if self.folder.is_dir():
             os.chdir(self.folder)
-            if str(self.folder) not in sys.path:
-                sys.path.append(str(self.folder))
+            look_last_in(self.folder)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,11 @@
 """Workers of a dask cluster, whose scheduler and workers somebody else has started."""
 
+import ipaddress
 import logging
 import queue
+import socket
 import uuid
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager, suppress
@@ -34,12 +37,13 @@ def dask_pool(address: str) -> Iterator[Pool]:
         import distributed
     except ModuleNotFoundError:
         raise missing_extra("distributed", "cluster", "--on dask://") from None
+    warn_of_public(address)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what is lost is said by us
     try:
         client = distributed.Client(f"tcp://{address}", timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SystemFailedError(
-            f"no dask scheduler answers at {address} ({error}); start one there with: dask scheduler"
+            f"no dask scheduler answers at {address} ({error}); start one there with: dask scheduler --host ADDRESS"
         ) from None
     with client:
         _prepare(client, address)
@@ -52,6 +56,27 @@ def dask_pool(address: str) -> Iterator[Pool]:
             with suppress(Exception):  # the scheduler may be gone
                 client.unsubscribe_topic(topic)
             pool.executor.shutdown(wait=False, cancel_futures=True)
+
+
+def warn_of_public(address: str) -> None:
+    """Warn where a scheduler, which runs the code of whoever reaches it, has an address of the Internet.
+
+    Args:
+        address: HOST:PORT; a name stands for all of its addresses.
+    """
+    host, _, port = address.rpartition(":")
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return  # the connection says what is wrong
+    public = [str(place[0]) for *_, place in found if ipaddress.ip_address(str(place[0]).partition("%")[0]).is_global]
+    if public:
+        warnings.warn(
+            f"the dask scheduler at {public[0]} is at a public address, by plain TCP: whoever reaches it runs code on "
+            "all of its machines; start it with --host and an address within your network, or 127.0.0.1 behind ssh",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _prepare(client: Any, address: str) -> None:

@@ -17,6 +17,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, cast
 
 from elastic_env.core.errors import ConfigurationError, shown
+from train.runs.import_path import safe_children
 from train.workers.calls import Pool, UnguardedScriptError, WorkerLostError
 
 _MOST_JOBS = 1024
@@ -48,7 +49,8 @@ def local_pool(jobs: int, calls: int) -> Iterator[Pool]:
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         sys.exit(1)  # this is a worker that imports the script of its parent, which says why it ended
-    resource_tracker.ensure_running()  # its start lets SIGINT through, and the threads that start workers block it
+    with safe_children():
+        resource_tracker.ensure_running()  # its start lets SIGINT through; the threads that start workers block it
     events: queue.SimpleQueue[Any] = queue.SimpleQueue()
     processes = Processes(num_processes(jobs, calls), events)
     try:
@@ -129,7 +131,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         reports, end = context.Pipe(duplex=False)
         self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(end,))
-        self.pool.submit(_nothing)  # starts it
+        with safe_children():
+            self.pool.submit(_nothing)  # starts it
         (self.process,) = cast("dict[int, SpawnProcess]", self.pool._processes).values()
         end.close()  # with that of the process the pipe ends too
         self._has_begun = False

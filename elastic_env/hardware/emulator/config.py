@@ -8,7 +8,7 @@ from pydantic import model_validator
 from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.servo_bus.control_table import servo_model
-from elastic_env.hardware.servo_bus.protocol import RATES, require_ids
+from elastic_env.hardware.servo_bus.protocol import HIGHEST_RATE, LOWEST_RATE, RATES, require_ids
 from elastic_env.robots.testbed.config import TestbedConfig
 
 
@@ -23,8 +23,10 @@ class EmulatorConfig(Model):
     """Their ids."""
     testbed: TestbedConfig = TestbedConfig()
     """The joints behind them, and through its scenario the quality of the IMU."""
-    imu_rate_hz: float = quantity("Hz", 100.0, gt=0, le=1000, description="packets of the IMU per second")
-    baudrate: int = quantity("bit/s", 3_000_000, gt=0, description="rate of the bus; no other is heard")
+    imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000, description="packets of the IMU per second")
+    baudrate: int = quantity(
+        "bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE, description="rate of the bus; no other is heard"
+    )
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
 

@@ -18,6 +18,7 @@ from elastic_env.hardware.servo_bus.torque_line import LARGEST_TORQUE_NM, torque
 _TURN = 2.0 * math.pi
 _LONGEST_UNTOLD = 2 * TEMPERATURE_CYCLES + 10
 """Cycles without a servo's temperature that stop the motion; replies that are missing for longer do so before."""
+_LEAST_RANGE_RAD = 0.01
 _TORQUE = "torque, by the current, that stops the motion"
 
 
@@ -26,19 +27,24 @@ class SafetyLimits(Model):
 
     lowest_rad: float = quantity("rad", -1.6, ge=-_TURN, le=_TURN, description="lowest goal")
     highest_rad: float = quantity("rad", 1.6, ge=-_TURN, le=_TURN, description="highest goal")
-    slew_rad_s: float = quantity("rad/s", 3.0, gt=0, le=10, description="fastest change of the goal")
-    speed_rad_s: float = quantity("rad/s", 4.5, gt=0, le=10, description="measured speed that stops the motion")
-    torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, gt=0, le=LARGEST_TORQUE_NM, description=_TORQUE)
-    temperature_c: float = quantity("°C", 80.0, gt=0, le=80, description="temperature above which the motion stops")
-    following_error_rad: float = quantity("rad", 0.35, gt=0, le=1.5, description="distance from the goal that stops it")
+    slew_rad_s: float = quantity("rad/s", 3.0, ge=0.01, le=10, description="fastest change of the goal")
+    speed_rad_s: float = quantity("rad/s", 4.5, ge=0.01, le=10, description="measured speed that stops the motion")
+    torque_nm: float = quantity("N·m", LARGEST_TORQUE_NM, ge=0.1, le=LARGEST_TORQUE_NM, description=_TORQUE)
+    temperature_c: float = quantity("°C", 80.0, ge=1, le=80, description="temperature above which the motion stops")
+    following_error_rad: float = quantity(
+        "rad", 0.35, ge=1e-3, le=1.5, description="distance from the goal that stops it"
+    )
     margin_rad: float = quantity("rad", 0.05, ge=0, le=0.5, description="how far beyond that range a position may lie")
     patience_cycles: int = quantity("1", 3, ge=1, le=10, description="cycles without a reply, or too much torque")
-    hang_s: float = quantity("s", 0.05, gt=0, le=0.09, description="time without a command that stops the motion")
+    hang_s: float = quantity("s", 0.05, ge=0.005, le=0.09, description="time without a command that stops the motion")
 
     @model_validator(mode="after")
     def _range_is_ordered(self) -> Self:
-        if self.lowest_rad >= self.highest_rad:
-            raise ValueError(f"lowest_rad must be below highest_rad, got {self.lowest_rad} and {self.highest_rad}")
+        if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
+            raise ValueError(
+                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got {self.lowest_rad} and "
+                f"{self.highest_rad}"
+            )
         return self
 
 

@@ -3,13 +3,14 @@
 It lives in a session of its own, so that neither Ctrl-C nor the death of the program that started it ends it before
 torque is off. Torque goes off when
 
-* the program ends, however it ends: its end of the channel closes;
+* the program ends, however it ends: its end of the channel closes, or Linux says that it is about to;
 * no command comes for `SafetyLimits.hang_s`: the program hangs;
 * the `Guard` finds a reason in what is measured;
 * it is itself asked to end (SIGTERM, SIGHUP, SIGINT), also during a read, also more than once.
 """
 
 import contextlib
+import os
 import signal
 import socket
 import sys
@@ -23,12 +24,15 @@ from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.safety.bounds import exceeds
 from elastic_env.hardware.safety.channel import LONGEST_WAIT_S, Channel
 from elastic_env.hardware.safety.checks import check_bus
+from elastic_env.hardware.safety.ending import is_ending
 from elastic_env.hardware.safety.limits import Guard, SafetyLimits, too_hot
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime, sleep_until
 from elastic_env.hardware.servo_bus.bus import Bus, Buses, States
 from elastic_env.hardware.servo_bus.control_table import explain_errors
 
 _REPLY_TIMEOUT_S = 0.003
+_GLANCE_S = 0.005
+"""Silence after which to look whether the program lives; a command comes every 4 ms [s]."""
 _WATCHDOG_COUNTS = 3  # of 20 ms
 _WATCHDOG_CLEAR = 0
 _REST_RAD_S = 0.2
@@ -41,10 +45,12 @@ class Supervisor:
     Args:
         channel: To the program.
         buses: Open, without servos attached.
+        program: Process id of the program.
     """
 
-    def __init__(self, channel: Channel, buses: list[Bus]) -> None:
+    def __init__(self, channel: Channel, buses: list[Bus], program: int) -> None:
         self._channel = channel
+        self._program = program
         self._bus = Buses(buses)
         self._guard: Guard | None = None
         self._commanded_s = 0.0
@@ -69,12 +75,20 @@ class Supervisor:
 
     def _next(self) -> dict[str, Any] | None:
         """The next request; a program that hangs loses its torque meanwhile."""
-        while not self._channel.is_waiting(self._patience_s()):
-            self._stop_hanging()
+        while not self._channel.is_waiting(self._glance_s()):
+            if is_ending(self._program):
+                return None
+            if self._patience_s() == 0.0:
+                self._stop_hanging()
         request = self._channel.receive()
         if request is not None and request["do"] == "read" and self._patience_s() == 0.0:
             self._stop_hanging()  # reading is not commanding
         return request
+
+    def _glance_s(self) -> float | None:
+        """How long to wait before looking whether the program lives [s]; None while nothing moves."""
+        patience_s = self._patience_s()
+        return None if patience_s is None else min(patience_s, _GLANCE_S)
 
     def _patience_s(self) -> float | None:
         """How long a command may still be waited for [s]; None while nothing moves."""
@@ -271,6 +285,7 @@ def _ignore(signal_number: int, _: Any) -> None:
 
 def main(ports: list[str], baudrate: int, channel: Channel) -> None:
     """Open the ports, say how that went, and serve."""
+    program = os.getppid()
     for number in _SIGNALS:
         signal.signal(number, _end)
     prefer_realtime(Priority.SUPERVISOR, with_threads=True)  # one for each of several buses
@@ -286,7 +301,7 @@ def main(ports: list[str], baudrate: int, channel: Channel) -> None:
         channel.send({"number": 0, "error": "PortError", "message": str(error)})
         return
     channel.send({"number": 0})
-    Supervisor(channel, buses).run()
+    Supervisor(channel, buses, program).run()
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ checksum count what is sent.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shown
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -39,6 +39,8 @@ STATUS_ERRORS = {
 _POLYNOMIAL = 0x8005
 RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 """Rates that servos, SDK and pseudo-terminals share, the likeliest first [bit/s]."""
+LOWEST_RATE, HIGHEST_RATE = 9_600, 10_500_000
+"""Of servos and IMU, by their manuals [bit/s]."""
 _LONGEST = 1024
 _STUFFED = b"\xff\xff\xfd"
 
@@ -50,7 +52,7 @@ def require_ids(ids: Sequence[int]) -> None:
         ConfigurationError: None are given, one of them twice, or one that no servo can have.
     """
     if not ids or len(set(ids)) != len(ids) or not all(0 <= i <= LARGEST_ID for i in ids):
-        raise ConfigurationError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {list(ids)}")
+        raise ConfigurationError(f"ids must be different numbers from 0 to {LARGEST_ID}, got {shown(list(ids))}")
 
 
 def _crc_of_byte(byte: int) -> int:

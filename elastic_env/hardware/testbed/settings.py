@@ -2,12 +2,18 @@
 
 import math
 import os
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.hardware.safety.limits import SafetyLimits
+from elastic_env.hardware.servo_bus.protocol import HIGHEST_RATE, LOWEST_RATE
+
+
+def _rate(default: int, description: str) -> Any:
+    """Bits per second of a port."""
+    return quantity("bit/s", default, ge=LOWEST_RATE, le=HIGHEST_RATE, description=description)
 
 
 class HardwareSettings(Model):
@@ -16,21 +22,23 @@ class HardwareSettings(Model):
     port: str
     """Port of the servo, such as /dev/ttyUSB0, or of an emulator; on the command line --port."""
     servo_id: int = quantity("1", 1, ge=0, le=252, description="id of the servo")
-    baudrate: int = quantity("bit/s", 3_000_000, gt=0, description="rate of the servo's bus")
+    baudrate: int = _rate(3_000_000, "rate of the servo's bus")
     direction: Literal[1, -1] = 1
     """Sign of the joint angle against the servo's."""
     zero_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi, description="servo angle where the pendulum hangs")
     imu_port: str | None = None
     """Port of the IMU on the link; without one everything that needs the link angle is nan."""
-    imu_baudrate: int = quantity("bit/s", 115_200, gt=0, description="rate of the IMU's port")
+    imu_baudrate: int = _rate(115_200, "rate of the IMU's port")
     imu_oldest_s: float = quantity("s", 0.05, ge=0.01, le=1, description="age at which an attitude counts as missing")
     imu_axis: Literal["roll", "pitch", "yaw"] = "roll"
     """Euler angle that turns with the joint."""
     imu_sign: Literal[1, -1] = 1
     """Sign of the joint angle against that Euler angle."""
     imu_offset_rad: float = quantity("rad", 0.0, gt=-math.pi, lt=math.pi, description="what it shows where q is 0")
-    largest_deflection_rad: float = quantity("rad", 0.2, gt=0, le=1, description="bend that stops it, by the IMU")
-    approach_rad_s: float = quantity("rad/s", 0.2, gt=0, le=2, description="peak speed to the start and back to rest")
+    largest_deflection_rad: float = quantity("rad", 0.2, ge=1e-3, le=1, description="bend that stops it, by the IMU")
+    approach_rad_s: float = quantity(
+        "rad/s", 0.2, ge=0.01, le=2, description="peak speed to the start and back to rest"
+    )
     confirm: bool = True
     """Whether somebody at the terminal must agree before the first motion."""
     limits: SafetyLimits = SafetyLimits()

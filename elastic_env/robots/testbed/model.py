@@ -21,9 +21,11 @@ GRAVITY_M_S2 = 9.81
 class Pendulum(Model):
     """The load of the testbed."""
 
-    gravity_torque: float = quantity("N·m", 60.0, gt=0, description="torque that holds it at the horizontal")
-    mass: float = quantity("kg", 10.0, gt=0, description="mass of bob and linkage")
-    gyration_radius: float = quantity("m", 0.1, gt=0, description="radius of gyration about its center of mass")
+    gravity_torque: float = quantity("N·m", 60.0, ge=1e-3, le=1e4, description="torque that holds it at the horizontal")
+    mass: float = quantity("kg", 10.0, ge=1e-3, le=1e4, description="mass of bob and linkage")
+    gyration_radius: float = quantity(
+        "m", 0.1, ge=1e-3, le=10, description="radius of gyration about its center of mass"
+    )
 
     @property
     def com_distance(self) -> float:

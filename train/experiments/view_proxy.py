@@ -1,0 +1,370 @@
+"""A reverse proxy before MuJoCo's web viewer, which lets in only who has the page's own address.
+
+The viewer listens on every address, checks no Origin, and takes any model that is dropped on its page. Here it listens
+on a Unix socket in a folder of this user's. The proxy listens on a port, and refuses with 403
+
+* a request without the token, which the printed address carries and a cookie keeps;
+* a Host that is not the page's (DNS rebinding), and an Origin that is not the Host's (another web page);
+* uploads: every method but GET, and every WebSocket but the two that the page draws from.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import re
+import secrets
+import socket
+import threading
+from collections.abc import Coroutine, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, shown
+
+LOOPBACK = "127.0.0.1"
+"""Where a page listens unless somebody asks for another address."""
+
+_FIRST_PORT = 8080
+_PORTS_TRIED = 20
+_LARGEST_PORT = 65535
+_LARGEST_HEAD = 32768
+"""Of a request or a response [bytes]."""
+_HEAD_S = 10.0
+"""For a request to arrive [s]."""
+_TOKEN = "token"
+_UPLOAD = "/drop"
+_SOCKETS = ("/ui", "/state")
+_UPGRADED = (
+    "Upgrade",
+    "Connection",
+    "Sec-WebSocket-Key",
+    "Sec-WebSocket-Version",
+    "Sec-WebSocket-Protocol",
+    "Sec-WebSocket-Extensions",
+)
+"""Headers of a WebSocket's opening that the viewer gets."""
+_PRIVATE = (
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+    ("Referrer-Policy", "no-referrer"),
+    ("X-Content-Type-Options", "nosniff"),
+    ("X-Frame-Options", "DENY"),
+)
+_HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(:(?P<port>\d+))?")
+_CLOSED = (asyncio.IncompleteReadError, TimeoutError, OSError)
+
+Header = tuple[str, str]
+
+
+class RefusedError(Exception):
+    """A request that the page does not answer; the text says why."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """The first line and the headers of a request or a response.
+
+    Attributes:
+        line: The first line.
+        headers: Names and values, in their order.
+    """
+
+    line: str
+    headers: Sequence[Header]
+
+    @staticmethod
+    def parse(data: bytes) -> "Head":
+        """A head as it arrived, with the empty line at its end.
+
+        Raises:
+            RefusedError: It is none.
+        """
+        line, *others = data.decode("latin-1").removesuffix("\r\n\r\n").split("\r\n")
+        headers = []
+        for other in others:
+            name, colon, value = other.partition(":")
+            if not colon or not name or name != name.strip():
+                raise RefusedError("a header is malformed")
+            headers.append((name, value.strip()))
+        return Head(line, headers)
+
+    def values(self, name: str) -> list[str]:
+        """All values of a header."""
+        return [value for other, value in self.headers if other.lower() == name.lower()]
+
+    def encoded(self) -> bytes:
+        """As it is sent."""
+        lines = [self.line, *(f"{name}: {value}" for name, value in self.headers)]
+        return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request that was let in.
+
+    Attributes:
+        path: What it asks for, without the token.
+        is_socket: Whether it opens a WebSocket.
+        has_address: Whether it has the token in its address, as the first request of a page.
+    """
+
+    path: str
+    is_socket: bool
+    has_address: bool
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may see a page.
+
+    Attributes:
+        host: Where it listens, as it was asked for.
+        port: Its port.
+        token: What the address must carry.
+    """
+
+    host: str
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+
+    @property
+    def address(self) -> str:
+        """What a browser opens."""
+        name = socket.gethostname() if self._is_everywhere else self.host
+        name = f"[{name}]" if ":" in name else name
+        return f"http://{name}:{self.port}/?{_TOKEN}={self.token}"
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie: browsers send cookies to all ports of a host."""
+        return f"elastic_view_{self.port}"
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs of this machine reach the page."""
+        return _is_loopback(self.host)
+
+    @property
+    def _is_everywhere(self) -> bool:
+        return self.host in ("", "0.0.0.0", "::")
+
+    def admit(self, request: Head) -> Asked:
+        """Read a request.
+
+        Raises:
+            RefusedError: It is not for this page, or not from it.
+        """
+        method, _, rest = request.line.partition(" ")
+        target, _, version = rest.partition(" ")
+        if version not in ("HTTP/1.1", "HTTP/1.0") or not target.startswith("/"):
+            raise RefusedError("the request is malformed")
+        path, _, query = target.partition("?")
+        self._require_own_host(request)
+        parts = query.split("&")
+        given = [part.removeprefix(f"{_TOKEN}=") for part in parts if part.startswith(f"{_TOKEN}=")]
+        has_address = any(self._is_token(value) for value in given)
+        if not has_address and not any(self._is_token(value) for value in self._cookies(request)):
+            raise RefusedError("the token is missing: open the address that elastic view has printed")
+        is_socket = bool(request.values("Upgrade"))
+        _require_download(method, path, request, is_socket)
+        query = "&".join(part for part in parts if part and not part.startswith(f"{_TOKEN}="))
+        return Asked(f"{path}?{query}" if query else path, is_socket, has_address)
+
+    def _require_own_host(self, request: Head) -> None:
+        hosts = request.values("Host")
+        if len(hosts) != 1 or not self._is_own(hosts[0].lower()):
+            raise RefusedError("the Host is not this page's: open the address that elastic view has printed")
+        origins = request.values("Origin")
+        if any(origin.lower() != f"http://{hosts[0].lower()}" for origin in origins) or len(origins) > 1:
+            raise RefusedError("the request comes from another page")
+
+    def _is_own(self, host: str) -> bool:
+        found = _HOST.fullmatch(host)
+        if found is None or int((found["port"] or "80")[:6]) != self.port:
+            return False
+        name = found["name"].strip("[]")
+        if self._is_everywhere and _is_address(name):
+            return True  # a foreign page cannot make its own name stand for an address that is none
+        names = {self.host.lower()}
+        if self.is_local or self._is_everywhere:
+            names |= {"localhost", LOOPBACK, "::1"}
+        if not self.is_local:
+            names |= {socket.gethostname().lower()}
+        return name in names
+
+    def _is_token(self, value: str) -> bool:
+        return secrets.compare_digest(value.encode(), self.token.encode())
+
+    def _cookies(self, request: Head) -> list[str]:
+        pairs = [pair.strip().partition("=") for line in request.values("Cookie") for pair in line.split(";")]
+        return [value for name, _, value in pairs if name == self.cookie]
+
+
+def _require_download(method: str, path: str, request: Head, is_socket: bool) -> None:
+    if path.rstrip("/").lower() == _UPLOAD:
+        raise RefusedError("this page takes no uploads")
+    if method != "GET" or request.values("Content-Length") or request.values("Transfer-Encoding"):
+        raise RefusedError("this page only answers GET without a body")
+    if is_socket and path not in _SOCKETS:
+        raise RefusedError(f"WebSockets are {', '.join(_SOCKETS)}")
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_loopback(host: str) -> bool:
+    return host.lower() == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def listen(host: str = LOOPBACK, port: int = 0) -> socket.socket:
+    """A socket that listens for browsers.
+
+    Args:
+        host: Address or name of this machine; "0.0.0.0" or "::" for all of its addresses.
+        port: 0 takes the first free one from 8080 on.
+
+    Raises:
+        ConfigurationError: Host or port cannot be.
+        SystemFailedError: The port is taken, or this machine has no such address.
+    """
+    if not 0 <= port <= _LARGEST_PORT:
+        raise ConfigurationError(f"--port must be from 0 to {_LARGEST_PORT}, 0 for a free one, got {shown(port)}")
+    try:
+        family, *_ = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except (socket.gaierror, UnicodeError):
+        raise ConfigurationError(
+            f"--host must be an address or a name of this machine, such as {LOOPBACK}, got {shown(host)}"
+        ) from None
+    problem = OSError()
+    for one in [port] if port else [*range(_FIRST_PORT, _FIRST_PORT + _PORTS_TRIED), 0]:
+        try:
+            return socket.create_server((host, one), family=family, dualstack_ipv6=host == "::")
+        except OSError as error:
+            problem = error
+    raise SystemFailedError(
+        f"the page cannot listen at {shown(host)}, port {port}: {problem.strerror}; name another --port, or 0 for a "
+        "free one"
+    ) from None
+
+
+class Proxy:
+    """Answers browsers in a thread, until it is closed.
+
+    Args:
+        listener: Where browsers come in, see `listen`.
+        viewer: Path of the Unix socket at which the viewer answers.
+        access: Who is let in.
+    """
+
+    def __init__(self, listener: socket.socket, viewer: str, access: Access) -> None:
+        self._listener = listener
+        self._viewer = viewer
+        self._access = access
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Answer nobody any more."""
+        with contextlib.suppress(RuntimeError):  # it has ended
+            self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._listener.close()
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            start = asyncio.start_server(self._answer, sock=self._listener, limit=_LARGEST_HEAD)
+            self._loop.run_until_complete(start)
+            self._loop.run_forever()
+        finally:
+            tasks = asyncio.all_tasks(self._loop)
+            for task in tasks:
+                task.cancel()
+            self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+            self._loop.close()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One connection, which is for one request."""
+        with contextlib.suppress(*_CLOSED):
+            try:
+                request = await _read_head(reader)
+                asked = self._access.admit(request)
+            except RefusedError as error:
+                writer.write(_refusal(str(error)))
+                await writer.drain()
+            else:
+                await self._pass_on(request, asked, reader, writer)
+        writer.close()
+
+    async def _pass_on(
+        self, request: Head, asked: Asked, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        viewer_reader, viewer_writer = await asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
+        try:
+            viewer_writer.write(_for_viewer(request, asked).encoded())
+            answer = Head.parse(await viewer_reader.readuntil(b"\r\n\r\n"))
+            writer.write(self._for_browser(answer, asked).encoded())
+            ways: list[Coroutine[Any, Any, None]] = [_copy(viewer_reader, writer)]
+            if asked.is_socket:
+                ways.append(_copy(reader, viewer_writer))
+            await _run_until_one_ends(ways)
+        finally:
+            viewer_writer.close()
+
+    def _for_browser(self, answer: Head, asked: Asked) -> Head:
+        """An answer that no other page may read, and with the cookie where a page begins."""
+        kept = [(name, value) for name, value in answer.headers if not _opens_page(name)]
+        headers = [*kept, *_PRIVATE]
+        if not asked.is_socket:
+            headers = [*(header for header in headers if header[0].lower() != "connection"), ("Connection", "close")]
+        if asked.has_address:
+            kind = "Path=/; HttpOnly; SameSite=Strict"
+            headers.append(("Set-Cookie", f"{self._access.cookie}={self._access.token}; {kind}"))
+        return Head(answer.line, headers)
+
+
+async def _read_head(reader: asyncio.StreamReader) -> Head:
+    try:
+        return Head.parse(await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_S))
+    except asyncio.LimitOverrunError:
+        raise RefusedError(f"a request may have {_LARGEST_HEAD} bytes of headers") from None
+
+
+def _for_viewer(request: Head, asked: Asked) -> Head:
+    """A request as the viewer gets it: without token, cookies and Origin."""
+    headers = [("Host", "viewer")]
+    if asked.is_socket:
+        headers += [(name, value) for name in _UPGRADED for value in request.values(name)]
+    return Head(f"GET {asked.path} HTTP/1.1", headers)
+
+
+def _opens_page(name: str) -> bool:
+    """Whether a header of the viewer lets other pages read an answer."""
+    return name.lower().startswith("access-control-") or name.lower() == "cross-origin-resource-policy"
+
+
+def _refusal(reason: str) -> bytes:
+    body = f"403: {reason}\n".encode()
+    headers = [("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))]
+    return Head("HTTP/1.1 403 Forbidden", [*headers, ("Connection", "close"), *_PRIVATE]).encoded() + body
+
+
+async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+    while data := await source.read(_LARGEST_HEAD):
+        target.write(data)
+        await target.drain()
+
+
+async def _run_until_one_ends(ways: Sequence[Coroutine[Any, Any, None]]) -> None:
+    tasks = [asyncio.ensure_future(way) for way in ways]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
