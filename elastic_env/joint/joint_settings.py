@@ -21,6 +21,8 @@ HELD = "held"
 """Value of a joint that nobody commands: it stays where the model's first keyframe has it."""
 RIGID = "rigid"
 """Value of a joint without a spring; the same as an infinite stiffness."""
+SOFTEST = 1e-9
+"""Least stiffness and position gain; below it nothing is a joint, and 1/K is no number [N·m/rad]."""
 CURE = (
     "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it from static poses and writes a "
     "file for `joints`; `elastic identify --robot MODEL --plan 20` proposes poses"
@@ -57,6 +59,12 @@ class ServoSettings(Model):
         description="default the model's force range, else what holds three times the weight and gives 20 rad/s²",
     )
     speed_limit: float | None = quantity("rad/s", None, gt=0, description="no-load speed; default a turn a second")
+
+    @model_validator(mode="after")
+    def _pushes(self) -> Self:
+        if self.position_gain is not None and self.position_gain < SOFTEST:
+            raise ValueError(f"position_gain must be at least {SOFTEST:g} [N·m/rad], got {self.position_gain:g}")
+        return self
 
     def over(self, found: "ServoSettings") -> "ServoSettings":
         """These settings where they say something, else what was found in the model.
@@ -120,9 +128,9 @@ class JointSettings(Model):
     servo: ServoSettings = ServoSettings()
 
     @model_validator(mode="after")
-    def _stiffness_is_a_number(self) -> Self:
-        if np.isnan(self.stiffness):
-            raise ValueError("stiffness must be a number > 0 [N·m/rad], got nan")
+    def _is_stiff(self) -> Self:
+        if not self.stiffness >= SOFTEST:
+            raise ValueError(f"stiffness must be at least {SOFTEST:g} [N·m/rad], got {self.stiffness:g}")
         return self
 
     @property
@@ -199,7 +207,8 @@ def _settings(name: str, value: Any) -> JointSettings | None:
         )
     if _is(own["stiffness"], RIGID):
         own = {**own, "stiffness": np.inf}
+    settings: dict[str, Any] = {str(key): part for key, part in own.items()}
     try:
-        return JointSettings(**{str(key): part for key, part in own.items()})
+        return JointSettings(**settings)
     except ConfigurationError as error:
         raise ConfigurationError(f"joint {name!r}: {error}") from None
