@@ -101,12 +101,12 @@ def parse_yaml(text: str) -> Any:
         loader.dispose()
 
 
-_PATTERN = re.compile(r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?P<value>:[^,}#]*)?""")
+_PATTERN = re.compile(r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?::(?P<value>\s*\{[^}]*\}|[^,}#]*))?""")
 
 
 def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
     """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an alias."""
-    lines = text.splitlines()
+    lines = [] if error.problem is None or error.problem.startswith("the alias") else text.splitlines()
     for mark in (error.context_mark, error.problem_mark):
         if mark is None or mark.line >= len(lines):
             continue
@@ -114,7 +114,8 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
             if not found.start() <= mark.column < found.end("key"):
                 continue
             key = found["key"][:40]
-            value = "" if found["value"] is None else ": " + found["value"][1:].strip()[:40]
+            key = key if "[" in key and "]" in key else key.strip("[]")
+            value = "" if found["value"] is None else f": {found['value'].strip()[:40]}"
             return _refusal_at(mark, f'put the pattern in quotes: "{key}"{value}')
     return error
 
