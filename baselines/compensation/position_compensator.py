@@ -261,7 +261,8 @@ class PositionCompensator:
         """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
         lowest = np.where(np.isfinite(self._lowest), self._lowest, -np.pi)
         highest = np.where(np.isfinite(self._highest), self._highest, np.pi)
-        poses = np.random.default_rng(0).uniform(lowest, highest, (_POSES, len(self.joints)))
+        generator = np.random.default_rng(0)
+        poses = generator.uniform(lowest, highest, (_POSES, len(self.joints)))
         torque = np.abs(self._links.gravity_torque(poses))
         found = torque.max(axis=0)
         for joint, pose in enumerate(poses[torque.argmax(axis=0)]):
