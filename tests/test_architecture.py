@@ -81,6 +81,7 @@ ROOMS = [
     "train.hardware", "train.commands", "train",
 ]  # fmt: skip
 """Folders, and modules beside them, in the order in which they may import: each from those before it."""
+MOST_PARAMETERS = 7
 
 
 def room_of(name: str) -> str:
