@@ -10,7 +10,8 @@ from elastic_env.motion.trajectory import PlanRow
 
 _SHARE = 0.004
 """Motion within a window that is worth a word, over the sag. An error of 2 % that fades by 1/s moves by as much."""
-_SMALLEST_RAD = 1e-6
+_SMALLEST_RAD = 1e-5
+"""Motion that is worth no word, even where a robot does not sag."""
 
 
 class RestWatch:

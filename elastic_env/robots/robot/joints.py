@@ -22,6 +22,10 @@ DAMPING_RATIO = 0.17
 """Of rotor and link on the spring between them; about that of the testbed's joint, K 1001, B 0.839, D 10 [1]."""
 _SERVO_TO_SPRING = 50.0
 """k_p of a servo that nobody knows over K: stiff enough to add little to the deflection while its integrator acts."""
+_LEAST_SERVO_TO_SPRING, _SERVO_RAD_S = 5.0, 1000.0
+"""The same where the rotor is as light as its links: by the frequency of the rotor on its servo, at least 5 K."""
+_FASTEST_PER_S = 2500.0
+"""Rate of assumed dampers, which a physics step of 0.5 ms follows [1/s]."""
 _SPEED_LIMIT_RAD_S = 2.0 * np.pi
 """An assumption: position servos of arms turn about once a second."""
 DECAY_RATE_PER_S = 5.0
@@ -160,8 +164,10 @@ class _Assumed:
         actuator = None if is_given else position_servo(self._model, self._name)
         if actuator is not None and own.servo.velocity_gain is None:
             damping -= actuator.joint_damping
-        rotor = _first(own.rotor_inertia, rotor_inertia(self._model, self._name) or None, self._rotor_inertia())
         servo = own.servo.over(ServoSettings() if actuator is None else actuator.settings)
+        known = own.rotor_inertia or rotor_inertia(self._model, self._name) or None
+        rotor = self._rotor_inertia(servo.velocity_gain or 0.0) if known is None else known
+        ratio = self._servo_to_spring(rotor) if known is None else _SERVO_TO_SPRING
         return ElasticJoint(
             stiffness=own.stiffness,
             rotor_inertia=rotor,
@@ -170,21 +176,31 @@ class _Assumed:
             viscous_friction=_first(own.viscous_friction, damping),
             backlash=own.backlash,
             encoder_counts_per_turn=own.encoder_counts_per_turn,
-            servo=self._servo(servo, rotor, is_given),
+            servo=self._servo(servo, rotor, ratio, is_given),
         )
 
-    def _rotor_inertia(self) -> float:
-        """B of a rotor that nobody knows: by its frequency on the spring, and no more than its links have."""
-        by_frequency, most = self._own.stiffness / ROTOR_FREQUENCY_RAD_S**2, self._links.most
+    def _rotor_inertia(self, velocity_gain: float) -> float:
+        """B of a rotor that nobody knows: by its frequency on the spring, and no more than its links have.
+
+        A servo of a known velocity gain needs a rotor that is not too light for it.
+        """
+        by_frequency = self._own.stiffness / ROTOR_FREQUENCY_RAD_S**2
+        most = max(self._links.most, velocity_gain / _FASTEST_PER_S)
         if by_frequency <= most:
             return by_frequency
-        is_known = self._own.rotor_inertia is not None or rotor_inertia(self._model, self._name) > 0.0
-        if not is_known:
-            self.said.append(
-                f"rotor_inertia of {self._name} {most:.3g} kg·m², as much as its links have, as K/(100 rad/s)² "
-                f"would be {by_frequency:.3g}"
-            )
+        scale = "its links have" if most == self._links.most else "its velocity gain needs"
+        self.said.append(
+            f"rotor_inertia of {self._name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)² would be "
+            f"{by_frequency:.3g}"
+        )
         return most
+
+    def _servo_to_spring(self, rotor: float) -> float:
+        """k_p over K of a servo that nobody knows, on a rotor whose inertia is assumed."""
+        K = self._own.stiffness
+        if rotor == K / ROTOR_FREQUENCY_RAD_S**2:
+            return _SERVO_TO_SPRING
+        return min(max(rotor * _SERVO_RAD_S**2 / K, _LEAST_SERVO_TO_SPRING), _SERVO_TO_SPRING)
 
     def _damping(self, rotor: float) -> float:
         r"""D of a transmission that nobody knows [N·m·s/rad].
@@ -192,17 +208,18 @@ class _Assumed:
         Rotor and lightest links swing with the damping ratio of the testbed's. All links that swing together come to
         rest, too: with :math:`m_j = \sum_i |M_{ji}|` every mode of the links on their springs has :math:`\varphi^T M
         \varphi \le \sum_j m_j \varphi_j^2`, so that :math:`D_j \ge 2 \sigma m_j` lets it decay by :math:`\sigma`.
-        A soft spring is damped critically at most.
+        A soft spring is damped critically at most, and light links no faster than a physics step follows.
         """
         K, least, together = self._own.stiffness, self._links.least, self._links.together
         of_lightest = DAMPING_RATIO * np.sqrt(K * rotor * least / (rotor + least))
         of_slowest = min(DECAY_RATE_PER_S * together, np.sqrt(K * together))
-        return float(2.0 * max(of_lightest, of_slowest))
+        fastest = _FASTEST_PER_S / 2.0 * rotor * least / (rotor + least)
+        return float(2.0 * max(of_lightest, min(of_slowest, fastest)))
 
-    def _servo(self, known: ServoSettings, rotor: float, is_given: bool) -> Servo:
+    def _servo(self, known: ServoSettings, rotor: float, ratio: float, is_given: bool) -> Servo:
         """The servo of which some is known."""
         links = self._links
-        kp = _first(known.position_gain, _SERVO_TO_SPRING * self._own.stiffness)
+        kp = _first(known.position_gain, ratio * self._own.stiffness)
         kv = known.velocity_gain
         if kv is None and known.position_gain is None:
             kv = 2.0 * np.sqrt(kp * rotor)
