@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -362,3 +363,93 @@ def test_servos_of_the_model_that_give_way_are_named() -> None:
         alone = PositionCompensator.from_model(spec, 500.0)
     held = PositionCompensator.from_model(spec, 500.0, position_gain=math.inf)
     np.testing.assert_array_equal(alone.command([0.3, 0.2, 0.1]), held.command([0.3, 0.2, 0.1]))
+
+
+PENDULUM = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="j" axis="0 -1 0" range="-86 183"/>
+  <inertial mass="4" pos="0 0 -0.25" diaginertia="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
+SOFT = 20.0
+"""k_p of its servo [N·m/rad], under a weight of 9.81 N·m."""
+
+
+def said_by(compensator: Any) -> list[str]:
+    """Warnings of a function."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        compensator()
+    return [str(one.message) for one in said]
+
+
+def test_a_limit_that_the_weight_exceeds_is_said_once_with_what_is_enough() -> None:
+    """Catches a link that ends 16 degrees short without a word. The need is 9.81/20 rad, in closed form."""
+    pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
+    found = []
+
+    def play(**options: Any) -> None:
+        made = PositionCompensator.from_model(pendulum, math.inf, position_gain=SOFT, **options)
+        found.append(float(made.command([np.pi / 2])[0] - np.pi / 2))
+        made.command([1.5])
+
+    said = said_by(play)
+    assert len(said) == 1
+    assert "needs an offset of 0.49 rad of joint 'j'" in said[0]
+    enough = float(re.findall(r"limit_rad=([0-9.]+) is enough", said[0])[0])
+    assert 9.81 / SOFT < enough < 0.6
+    assert said_by(lambda: play(limit_rad=enough)) == []
+    assert found == pytest.approx([0.2, 9.81 / SOFT])
+
+
+def test_a_limit_that_a_payload_or_a_motion_exceeds_is_said_when_it_is_met() -> None:
+    """Catches a clip that only the payload or an acceleration brings, in silence; and one that is said at each call."""
+    pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
+
+    def play() -> None:
+        made = PositionCompensator.from_model(pendulum, 100.0)
+        made.command([1.0], [0.0], [50.0])
+        made.command([1.0], [0.0], [60.0])
+
+    said = said_by(play)
+    assert len(said) == 1
+    assert re.search(r"offset of 0\.2\d+ rad of joint 'j' now.*limit_rad=0\.\d+ is enough", said[0])
+
+
+def test_a_joint_range_that_a_command_would_leave_is_said_once() -> None:
+    """Catches a link that stays short of the end of its range without a word."""
+    pendulum = mujoco.MjModel.from_xml_string(PENDULUM.replace("183", "90"))
+
+    def play() -> None:
+        made = PositionCompensator.from_model(pendulum, 100.0)
+        made.command([np.pi / 2])
+        made.command([np.pi / 2])
+
+    said = said_by(play)
+    assert len(said) == 1
+    assert re.search(r"'j' needs the command 1.669 rad, beyond its range.*0.098 rad short", said[0])
+
+
+def test_a_payload_that_jumps_is_said_once_with_a_ramp() -> None:
+    """Catches a jump of the command without a word. 9.81 N/kg at 0.25 m over 400 N·m/rad are 6.1 mrad a kg."""
+    pendulum = mujoco.MjModel.from_xml_string(PENDULUM)
+
+    def play(**options: Any) -> None:
+        made = PositionCompensator.from_model(pendulum, 400.0, **options)
+        made.set_payload(1.0, at=(0.0, 0.0, -0.25))  # before the first command nothing jumps
+        made.command([np.pi / 2])
+        made.set_payload(4.1, at=(0.0, 0.0, -0.25))
+        made.command([np.pi / 2])
+        made.set_payload(0.0, at=(0.0, 0.0, -0.25))
+
+    said = said_by(play)
+    assert len(said) == 1
+    assert re.search(r"payload moves the command of joint 'j' by 19 mrad at once; ramp_s=1 takes it over", said[0])
+    assert said_by(lambda: play(ramp_s=1.0)) == []
+
+    def elsewhere() -> None:
+        made = PositionCompensator.from_model(pendulum, 400.0, ramp_s=0.02)
+        made.set_payload(3.0, at=(0.0, 0.0, -0.25))
+        for _ in range(3):
+            made.command([np.pi / 2])
+        made.set_payload(3.0, at=(0.0, 0.0, -0.5))
+
+    said = said_by(elsewhere)
+    assert len(said) == 1
+    assert "set the payload to 0 where it was, and let ramp_s pass" in said[0]

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -288,3 +289,19 @@ def test_link_encoders_tell_the_stiffness_of_every_joint() -> None:
     np.testing.assert_allclose(policy.link_estimate(observation, state), env.unwrapped.truth().q[0], atol=1e-3)
     fixed = metrics_of(scalar(scenario="ideal+spread", timestep_s=0.001), "dynamic")["end_effector_error_rms_m"]
     assert info["episode_metrics"]["end_effector_error_rms_m"] < 0.5 * fixed
+
+
+def test_an_action_that_cannot_take_the_weight_back_is_said_before_it_is_played() -> None:
+    """Catches half of a sag that stays as actions are cut, without a word. The need is τ/k_p, in closed form."""
+    soft = {"*": {"stiffness": 1e4, "servo": {"position_gain": 60.0}}}
+    config = configure_robot(ARM, soft, reference="poses", scenario="ideal", end_effector="tool")
+    with pytest.warns(UserWarning, match=r"'poses' bends joint 'shoulder' by up to .* actions are cut at") as said:
+        plant = config.robot.plant(config)
+    plan = plant.motion.plan(np.random.default_rng(0), 0.004)
+    torque = np.abs(plant.static_torque(plan.q)[:, 1]).max()
+    text = next(str(one.message) for one in said if "actions are cut" in str(one.message))
+    assert float(re.findall(r"together need ([0-9.]+) N", text)[0]) == pytest.approx(torque / 0.3, rel=0.01)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="the weight")
+        stiff = configure_robot(ARM, {"*": 5e3}, scenario="ideal", end_effector="tool")
+        stiff.robot.plant(stiff)

@@ -51,3 +51,22 @@ def test_what_is_within_the_limits_is_read() -> None:
     }  # fmt: skip
     depth = DEEPEST_NESTING - 1
     assert parse_yaml("[" * depth + "1" + "]" * depth) is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "cure"),
+    [
+        ("*: 400", '"*": 400'),
+        ("a: 3\n*_joint: {stiffness: 4}\n", '"*_joint": {stiffness: 4}'),
+        ("{a: 3, *_b: 400}", '"*_b": 400'),
+        ("[ab]*: 400", '"[ab]*": 400'),
+        ("*:400", '"*": 400'),
+        ("joints: *", '"*"'),
+        ("joints: [a, *b]", '"*b"'),
+    ],
+)
+def test_a_star_without_quotes_gets_its_cure(text: str, cure: str) -> None:
+    """Catches the words of a parser for what the documentation itself recommends."""
+    with pytest.raises(yaml.YAMLError) as said:
+        parse_yaml(text)
+    assert f"put the pattern in quotes: {cure}\n" in f"{said.value}"

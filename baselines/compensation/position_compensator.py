@@ -11,7 +11,6 @@ are not in it. What a motor encoder shows is turned into the link angle by Eq. 1
 
 import warnings
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,7 +23,9 @@ from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.tree.torque import TreeTorque
+from elastic_env.joint.joint_settings import HELD, RIGID, SOFTEST, JointSettings, ServoSettings, key_of, read_joints
 from elastic_env.joint.model_file import compiled_model
+from elastic_env.joint.model_servo import position_servo
 from elastic_env.motion.trajectory import minimum_jerk
 
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
@@ -35,6 +36,10 @@ _LAST_STEP_RAD = 1e-8
 _MOST_ITERATIONS = 50
 _FILES = (".yaml", ".yml")
 _HOW_TO_GIVE = "give a number for all joints, one per joint, a mapping by name, or a YAML file (.yaml) of that"
+_POSES, _TRIES = 500, 33
+"""Poses at which the weight is looked at, and angles of a joint beside the heaviest of them."""
+_JUMP_RAD, _CALM_RAD_S = 1e-3, 0.02
+"""Jump of a command that is worth a word, and a rate of the command that is not [rad], [rad/s]."""
 _factored, _solved = get_lapack_funcs(("getrf", "getrs"))  # without the checks of lu_factor, which take longer
 
 
@@ -49,18 +54,24 @@ class PositionCompensator:
 
     Args:
         model: Compiled rigid model on a fixed base.
-        stiffness: K [N·m/rad]; infinite for a rigid joint. By name or pattern a value is a number, or a mapping that
-            has `stiffness`. A name goes before patterns, and a later pattern before an earlier one.
-        joints: Hinges that are commanded, in the order of the arrays; None for all in the order of the model. The other
-            joints are held where the model's first keyframe has them, or at its reference.
-        position_gain: k_p of servos that give way under a load [N·m/rad]; None or infinite for servos that hold their
-            angle. Where the model has position actuators and it is None, a warning says their k_p.
+        stiffness: K [N·m/rad]; infinite for a rigid joint. By name or pattern a value is a number, `rigid`, `held`, or
+            a mapping as `elastic_env.joint.joint_settings` reads it. Of such a mapping K and the servo's k_p and k_i
+            are used. Damping, friction and rotor inertia act on the way to rest alone, and backlash is refused.
+        joints: Hinges that are commanded, in the order of the arrays; None for all that are not held, in the order of
+            the model. The other joints are held where the model's first keyframe has them, or at its reference.
+        position_gain: k_p of servos that give way under a load [N·m/rad], infinite for servos that hold their angle;
+            None for what `stiffness` says of the servos. Where neither says it and the model has position actuators,
+            a warning says their k_p.
         limit_rad: Largest offset between command and desired angle [rad].
         ramp_s: Time in which offsets grow from zero after the start, and in which a payload is taken over [s].
         period_s: Time between two commands, for the ramp [s].
 
     Raises:
         ConfigurationError: The model or a value cannot be used; the message says which.
+
+    Warns:
+        UserWarning: Once each: the weight needs more than `limit_rad`, a command meets a limit, a payload moves the
+            command at once, or servos of the model give way and nobody says their k_p.
     """
 
     def __init__(
@@ -75,7 +86,12 @@ class PositionCompensator:
         period_s: float = 0.01,
     ) -> None:
         self._model = model
-        self.joints = tuple(_hinges(model) if joints is None else joints)
+        hinges = _hinges(model) if joints is None else list(joints)
+        known = _known_joints(model, stiffness, joints)
+        is_held = [known is not None and name in known and known[name] is None for name in hinges]
+        self.joints = tuple(name for name, out in zip(hinges, is_held, strict=True) if joints is not None or not out)
+        if hinges and not self.joints:
+            raise ConfigurationError(f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]")
         held = _held(model, self.joints)
         _require_known_torque(model, held)
         self._links = TreeTorque(model, self.joints, held)
@@ -83,18 +99,21 @@ class PositionCompensator:
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
         self._highest = np.where(limited, model.jnt_range[at, 1], np.inf)
-        for given in (stiffness, position_gain):
-            _require_patterns_that_fit(given, [*self.joints, *held])
-        self._compliance = 1.0 / _per_joint("stiffness", stiffness, self.joints)
-        self._of_command = self._compliance.copy()
-        if position_gain is None:
-            _warn_of_servos(model, self.joints)
+        if known is None:
+            servos = [ServoSettings()] * len(self.joints)
+            self._compliance = 1.0 / _per_joint("stiffness", stiffness, self.joints)
         else:
-            self._of_command += 1.0 / _per_joint("position_gain", position_gain, self.joints)
+            settings = _settings_of(known, self.joints)
+            servos = [one.servo for one in settings]
+            self._compliance = 1.0 / np.array([one.stiffness for one in settings])
+        _require_patterns_that_fit(position_gain, [*self.joints, *held])
+        self._of_command = self._compliance + 1.0 / _servo_gains(model, self.joints, servos, position_gain)
         self._limit, self._ramp = _number("limit_rad", limit_rad, "rad"), _number("ramp_s", ramp_s, "s", least=0.0)
         self._steps = max(int(np.ceil(self._ramp / _number("period_s", period_s, "s"))), 1)
+        self._said: set[str] = set()
         self._tip = int(model.jnt_bodyid[max(at, key=lambda j: int(model.jnt_bodyid[j]))])
         self.reset()
+        self._warn_of_room()
 
     @classmethod
     def from_model(
@@ -102,17 +121,24 @@ class PositionCompensator:
     ) -> Self:
         """From a file of MJCF or URDF, or from what MuJoCo made of one; further arguments as of the class.
 
-        `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`.
+        `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`. Hinges that such a file
+        does not name are rigid, as those are that were not identified.
 
         Raises:
             ConfigurationError: The file or a value cannot be used.
+
+        Warns:
+            UserWarning: See the class; or hinges are taken for rigid.
         """
-        is_file = isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES
-        return cls(compiled_model(model), read_mapping(Path(stiffness)) if is_file else stiffness, **options)  # type: ignore[arg-type]
+        compiled = compiled_model(model)
+        if isinstance(stiffness, str | Path) and Path(stiffness).suffix in _FILES:
+            return cls(compiled, _of_file(compiled, Path(stiffness), options.get("joints")), **options)
+        return cls(compiled, stiffness, **options)  # type: ignore[arg-type]
 
     def reset(self) -> None:
         """Begin anew: the ramp starts at zero, without a payload."""
         self._count = 0
+        self._asked: tuple[Array, Array | None, Array | None] | None = None
         self._load = self._load_wanted = self._load_step = 0.0
         self._carrier, self._place = self._tip, np.zeros(3)
         self._links.set_load(self._carrier, 0.0, self._place)
@@ -141,12 +167,15 @@ class PositionCompensator:
             carrier = bodies[body] if body in bodies else int(self._model.site_bodyid[sites[body]])
             if body not in bodies:
                 place = _in_body(self._model, sites[body], place)
+        before = None if self._asked is None else self._torque(*self._asked)
         if (carrier, *place) != (self._carrier, *self._place):
             self._load, self._carrier, self._place = 0.0, carrier, place
         self._load_wanted, self._load_step = mass, abs(mass - self._load) / self._steps
         if self._ramp == 0.0:
             self._load = mass
         self._links.set_load(self._carrier, self._load, self._place)
+        if before is not None and self._asked is not None:
+            self._warn_of_jump(self._of_command * (self._torque(*self._asked) - before))
 
     def torque(
         self, q: npt.ArrayLike, q_dot: npt.ArrayLike | None = None, q_ddot: npt.ArrayLike | None = None
@@ -179,6 +208,9 @@ class PositionCompensator:
         within = np.minimum(np.maximum(offset, -self._limit), self._limit) + motion[0]
         command = np.minimum(np.maximum(within, self._lowest), self._highest)
         self.clipped = command != offset + motion[0]
+        self._asked = motion
+        if self.clipped.any():
+            self._warn_of_limits(offset, motion[0])
         return command
 
     def link_angle(self, theta: npt.ArrayLike) -> Array:
@@ -217,6 +249,76 @@ class PositionCompensator:
         return ElasticError(
             f"no link angles for {theta} rad: Eq. 10 did not converge in {_MOST_ITERATIONS} steps; is the stiffness of "
             f"{self.joints[worst]} ({1.0 / self._compliance[worst]:.6g} N·m/rad) too low for its load?"
+        )
+
+    def _warn_of_room(self) -> None:
+        """Warn where the weight at some pose within the ranges needs a larger offset than the limit."""
+        needed = self._of_command * self._heaviest()
+        if (needed > self._limit).any():
+            self._warn_of_offset(int(needed.argmax()), float(needed.max()), "at some pose within the joint ranges")
+
+    def _heaviest(self) -> Array:
+        """Largest torques by weight over the joint ranges, at most a turn wide, (n,) [N·m]."""
+        lowest = np.where(np.isfinite(self._lowest), self._lowest, -np.pi)
+        highest = np.where(np.isfinite(self._highest), self._highest, np.pi)
+        generator = np.random.default_rng(0)
+        poses = generator.uniform(lowest, highest, (_POSES, len(self.joints)))
+        torque = np.abs(self._links.gravity_torque(poses))
+        found = torque.max(axis=0)
+        for joint, pose in enumerate(poses[torque.argmax(axis=0)]):
+            for i in range(len(pose)):  # by one joint after the other, uphill
+                tried = np.repeat(pose[None], _TRIES, axis=0)
+                tried[:, i] = np.linspace(lowest[i], highest[i], _TRIES)
+                there = np.abs(self._links.gravity_torque(tried)[:, joint])
+                if there.max() > found[joint]:
+                    found[joint] = there.max()
+                    pose = tried[there.argmax()]
+        return found
+
+    def _warn_of_limits(self, offset: Array, q: Array) -> None:
+        """Say once that a command met `limit_rad`, and once that it met a joint range."""
+        beyond = np.abs(offset)
+        if beyond.max() > self._limit:
+            self._warn_of_offset(int(beyond.argmax()), float(beyond.max()), "now")
+        wanted = q + offset
+        over = np.maximum(self._lowest - wanted, wanted - self._highest)
+        if over.max() > 0.0 and "range" not in self._said:
+            self._said.add("range")
+            worst = int(over.argmax())
+            ends = f"{self._lowest[worst]:.4g} to {self._highest[worst]:.4g} rad"
+            warnings.warn(
+                f"joint {self.joints[worst]!r} needs the command {wanted[worst]:.4g} rad, beyond its range of {ends} "
+                f"in the model: its link stays {over[worst]:.2g} rad short; keep q_desired that far from the end",
+                stacklevel=4,
+            )
+
+    def _warn_of_offset(self, joint: int, needed: float, when: str) -> None:
+        """Say once that `limit_rad` is too small."""
+        if "limit_rad" in self._said:
+            return
+        self._said.add("limit_rad")
+        digit = 10.0 ** (np.floor(np.log10(needed)) - 1.0)
+        enough = np.ceil(1.05 * needed / digit) * digit
+        warnings.warn(
+            f"the load needs an offset of {needed:.3g} rad of joint {self.joints[joint]!r} {when}, and commands are "
+            f"cut at limit_rad = {self._limit:g}: the link ends short of where it should be; limit_rad={enough:.3g} "
+            "is enough",
+            stacklevel=4,
+        )
+
+    def _warn_of_jump(self, jump: Array) -> None:
+        """Say once that a payload moved the command at once, by `jump`, (n,) [rad]."""
+        worst = int(np.abs(jump).argmax())
+        size = float(np.abs(jump[worst]))
+        if size <= _JUMP_RAD or "jump" in self._said:
+            return
+        self._said.add("jump")
+        cure = f"ramp_s={max(np.ceil(size / _CALM_RAD_S * 10.0) / 10.0, 0.5):.3g} takes it over in that time"
+        if self._ramp > 0.0:
+            cure = "set the payload to 0 where it was, and let ramp_s pass before it is put elsewhere"
+        warnings.warn(
+            f"the payload moves the command of joint {self.joints[worst]!r} by {1e3 * size:.3g} mrad at once; {cure}",
+            stacklevel=3,
         )
 
     def _motion(self, q: Any, q_dot: Any, q_ddot: Any) -> tuple[Array, Array | None, Array | None]:
@@ -313,22 +415,91 @@ def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> N
         raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
 
 
-def _warn_of_servos(model: mujoco.MjModel, joints: Sequence[str]) -> None:
-    """Warn where the model has position actuators, which give way under a load, at joints that are commanded."""
-    gains = {}
-    for i in range(model.nu):
-        joint = int(model.actuator_trnid[i, 0])
-        is_at_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT and model.joint(joint).name in joints
-        kp, is_pid = -float(model.actuator_biasprm[i, 1]), model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_PID
-        if is_at_joint and kp > 0.0 and not is_pid:
-            gains[model.joint(joint).name] = float(model.actuator_gear[i, 0]) ** 2 * kp
-    if gains:
-        given = ", ".join(f"{name}: {kp:g}" for name, kp in gains.items())
+def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
+    """What a file says of joints, in which the hinges that it leaves out are rigid."""
+    mapping = read_mapping(file)
+    rigid = [name for name in _hinges(model) if key_of(mapping, name) is None]
+    said = [name for name in rigid if commanded is None or name in commanded]
+    if said and len(said) < len(_hinges(model)):
         warnings.warn(
-            f"the model has position servos that give way under a load, which is not compensated; give "
-            f"position_gain={{{given}}} [N·m/rad], or position_gain=math.inf for servos that hold their angle",
+            f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}: {HELD} or its "
+            "stiffness K [N·m/rad] there",
             stacklevel=4,
         )
+    return mapping | dict.fromkeys(said, RIGID)
+
+
+def _known_joints(
+    model: mujoco.MjModel, given: Any, commanded: Sequence[str] | None
+) -> dict[str, JointSettings | None] | None:
+    """Settings by joint, None for one that is held; None where numbers alone are given."""
+    if not isinstance(given, Mapping):
+        return None
+    names = [model.joint(j).name for j in range(model.njnt)]
+    hinges = [name for j, name in enumerate(names) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and name]
+    known = read_joints(given, hinges, [name for name in names if name not in hinges])
+    for name in commanded or ():
+        if name in known and known[name] is None:
+            raise ConfigurationError(
+                f"joint {name!r} is named by `joints`, and stiffness says that it is {HELD}; give it a stiffness K "
+                "[N·m/rad], or leave it out of `joints`"
+            )
+    return known
+
+
+def _settings_of(known: Mapping[str, JointSettings | None], joints: Sequence[str]) -> list[JointSettings]:
+    """Settings of the joints that are commanded, all of which have to be known and without backlash."""
+    found: list[JointSettings] = []
+    for joint in joints:
+        own = known.get(joint)
+        if own is None:
+            raise ConfigurationError(
+                f"stiffness of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and inf for a "
+                "rigid joint. It is measured by a known torque and the deflection under it"
+            )
+        if own.backlash > 0.0:
+            raise ConfigurationError(
+                f"backlash of joint {joint!r} is {own.backlash:g} rad, which this compensator cannot take away: at "
+                f"rest {own.backlash / 2.0:g} rad remain to either side; leave the key out of what you give it"
+            )
+        found.append(own)
+    return found
+
+
+def _servo_gains(model: mujoco.MjModel, joints: Sequence[str], servos: Sequence[ServoSettings], given: Any) -> Array:
+    """k_p of servos that give way, infinite for those that hold their angle, (n,) [N·m/rad].
+
+    Args:
+        model: Whose actuators say it where nothing else does.
+        joints: Those that are commanded.
+        servos: What is known of their servos.
+        given: The argument `position_gain`.
+    """
+    said = [own.position_gain is not None or own.integral_gain is not None for own in servos]
+    if given is not None:
+        if any(said):
+            raise ConfigurationError(
+                f"the servo of joint {joints[said.index(True)]!r} is said twice, under `servo` in stiffness and by "
+                "position_gain; keep one of them"
+            )
+        return _per_joint("position_gain", given, joints)
+    gains = np.full(len(joints), np.inf)
+    unsaid: dict[str, float] = {}
+    for at, (joint, own) in enumerate(zip(joints, servos, strict=True)):
+        found = None if own.position_gain is not None else position_servo(model, joint)
+        of_model = ServoSettings() if found is None else found.settings
+        if said[at]:
+            gains[at] = own.over(of_model).sagging_gain(joint)
+        elif np.isfinite(gain := of_model.sagging_gain(joint)):
+            unsaid[joint] = gain
+    if unsaid:
+        listed = ", ".join(f"{name}: {gain:g}" for name, gain in unsaid.items())
+        warnings.warn(
+            f"the model has position servos that give way under a load, which is not compensated; give "
+            f"position_gain={{{listed}}} [N·m/rad], or position_gain=math.inf for servos that hold their angle",
+            stacklevel=4,
+        )
+    return gains
 
 
 def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
@@ -347,37 +518,32 @@ def _per_joint(name: str, given: Any, joints: Sequence[str]) -> Array:
             )
     else:
         values = [given] * len(joints)
-    return np.array(
-        [
-            _number(f"{name} of {joint}", value, "N·m/rad", finite=False)
-            for joint, value in zip(joints, values, strict=True)
-        ]
-    )
+    numbers = [
+        _number(f"{name} of {joint}", value, "N·m/rad", finite=False)
+        for joint, value in zip(joints, values, strict=True)
+    ]
+    for joint, number in zip(joints, numbers, strict=True):
+        if number < SOFTEST:
+            raise ConfigurationError(f"{name} of {joint} must be at least {SOFTEST:g} [N·m/rad], got {number:g}")
+    return np.array(numbers)
 
 
 def _require_patterns_that_fit(given: Any, joints: Sequence[str]) -> None:
     """Refuse a name or a pattern that is of no joint, such as a misspelt one."""
     for key in given if isinstance(given, Mapping) else ():
-        if not isinstance(key, str) or not any(fnmatchcase(joint, key) for joint in joints):
+        if not isinstance(key, str) or not any(key_of([key], joint) for joint in joints):
             raise unknown_name("joint or pattern of joints", key, joints)
 
 
 def _of_joint(name: str, given: Mapping[str, Any], joint: str) -> Any:
     """The value of a joint by its name or the last pattern that fits it."""
-    fitting = [key for key in given if fnmatchcase(joint, key)]
-    if not fitting:
+    key = key_of(given, joint)
+    if key is None:
         raise ConfigurationError(
-            f"{name} of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and inf for a rigid "
-            "joint. It is measured by a known torque and the deflection under it"
+            f"{name} of joint {joint!r} is missing; give {joint!r} or a pattern such as '*', and inf for a servo that "
+            "holds its angle"
         )
-    value = given[joint if joint in given else fitting[-1]]
-    if not isinstance(value, Mapping) or name != "stiffness":
-        return value
-    if "stiffness" not in value:
-        raise ConfigurationError(
-            f"stiffness of joint {joint!r} is missing beside {shown(list(value))}; write 'stiffness: K' [N·m/rad]"
-        )
-    return value["stiffness"]
+    return given[key]
 
 
 def _number(name: str, value: Any, unit: str, least: float | None = None, finite: bool = True) -> float:

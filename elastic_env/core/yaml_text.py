@@ -95,8 +95,29 @@ def parse_yaml(text: str) -> Any:
     loader = _Loader(text)
     try:
         return loader.get_single_data()
+    except yaml.MarkedYAMLError as error:
+        raise _with_quotes(text, error) from None
     finally:
         loader.dispose()
+
+
+_PATTERN = re.compile(r"""(?P<key>[^\s{},:'"]*\*[^\s{},:'"]*)\s*(?::(?P<value>\s*\{[^}]*\}|[^,}#]*))?""")
+
+
+def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError:
+    """The error with its cure, where a star, as in a pattern, is taken for YAML's sign of an alias."""
+    lines = [] if error.problem is None or error.problem.startswith("the alias") else text.splitlines()
+    for mark in (error.context_mark, error.problem_mark):
+        if mark is None or mark.line >= len(lines):
+            continue
+        for found in _PATTERN.finditer(lines[mark.line]):
+            if not found.start() <= mark.column < found.end("key"):
+                continue
+            key = found["key"][:40]
+            key = key if "[" in key and "]" in key else key.strip("[]")
+            value = "" if found["value"] is None else f": {found['value'].strip()[:40]}"
+            return _refusal_at(mark, f'put the pattern in quotes: "{key}"{value}')
+    return error
 
 
 def _require_plain(event: Any) -> None:
@@ -130,4 +151,8 @@ def _parts(node: yaml.Node | None) -> list[yaml.Node]:
 
 def _refusal(at: Any, problem: str) -> yaml.MarkedYAMLError:
     """An error that names the place."""
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
+    return _refusal_at(at.start_mark, problem)
+
+
+def _refusal_at(mark: Any, problem: str) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)

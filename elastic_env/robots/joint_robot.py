@@ -8,6 +8,7 @@
 follows the reference about its home, under the scenarios of robots that do not walk.
 """
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -37,7 +38,7 @@ from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.joint_config import JointConfig, RewardWeights, require_torque
-from elastic_env.runtime.joint_task import JointPlant, JointTask
+from elastic_env.runtime.joint_task import ACTION_BOUND_RAD, JointPlant, JointTask
 from elastic_env.runtime.robot_model import RobotModel, read_stiffness, with_stiffness
 from elastic_env.runtime.scenario import Scenario, make_scenario
 
@@ -154,8 +155,13 @@ class JointRobot:
             raise ConfigurationError(f"home must have one angle per joint, {len(true.joints)}, got {len(home)}")
         tool = None if self.end_effector is None else EndEffector(true.rigid, true.joint_names, self.end_effector)
         motion = ArmMotion(config.reference, _workspace(true, body, home, tool))
-        _require_feasible(config, true, body, motion)
+        plan = motion.plan(np.random.default_rng(0), config.control_period_s)
+        rows = slice(None, None, max(plan.num_steps // 500, 1))
+        q, q_dot, q_ddot = (np.ascontiguousarray(x[rows]) for x in (plan.q, plan.q_dot, plan.q_ddot))
+        _require_in_range(config, true, q)
+        _require_torque(config, true, body, (q, q_dot, q_ddot))
         assumed = RobotModel(_known_joints(config), self.rigid().compile(), config.control_period_s)
+        _warn_of_action_bound(config, assumed, body.gravity_torque(q))
         return JointPlant(
             name=self.name, model=self.elastic(config).compile(), assumed=assumed, true=true,
             static_torque=body.gravity_torque, motion=motion,
@@ -293,12 +299,11 @@ def _holds(robot: RobotModel, body: TreeTorque, q: Array) -> BoolArray:
     return np.all(np.abs(body.gravity_torque(q)) + robot.coulomb_friction < _SPARE * limits, axis=-1)
 
 
-def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: TreeTorque, motion: ArmMotion) -> None:
-    """Refuse a reference that the servos cannot follow, or beyond a joint's range, by a plan of it."""
-    plan = motion.plan(np.random.default_rng(0), config.control_period_s)
-    rows = slice(None, None, max(plan.num_steps // 500, 1))
-    q, q_dot, q_ddot = (np.ascontiguousarray(x[rows]) for x in (plan.q, plan.q_dot, plan.q_ddot))
-    _require_in_range(config, robot, q)
+def _require_torque(
+    config: JointRobotConfig, robot: RobotModel, body: TreeTorque, motion: tuple[Array, Array, Array]
+) -> None:
+    """Refuse a reference that the servos cannot follow; `motion` has its angles, rates and accelerations."""
+    q, q_dot, q_ddot = motion
     needed = np.abs(body.inverse_dynamics(q, q_dot, q_ddot) + robot.rotor_inertia * q_ddot).max(axis=0)
     needed += robot.coulomb_friction + robot.viscous_friction * np.abs(q_dot).max(axis=0)
     limits = np.array([servo.torque_limit for servo in robot.servos])
@@ -309,6 +314,28 @@ def _require_feasible(config: JointRobotConfig, robot: RobotModel, body: TreeTor
         raise ConfigurationError(
             f"the reference {config.reference.kind!r} can need {needed[weakest]:.1f} N·m of the servo of joint "
             f"{robot.joint_names[weakest]!r}, which is limited to {limits[weakest]:.1f} N·m; make its moves slower"
+        )
+
+
+def _warn_of_action_bound(config: JointRobotConfig, known: RobotModel, torque: Array) -> None:
+    """Warn where the weight along a reference bends joints by more than an action can take back.
+
+    Args:
+        config: With the reference.
+        known: Joints as a compensator knows them.
+        torque: Gravity torque along the reference, (T, n) [N·m].
+    """
+    stiffness = known.rest_stiffness(config.form)
+    needed = np.abs(torque).max(axis=0) / stiffness
+    worst = int(needed.argmax())
+    if needed[worst] > ACTION_BOUND_RAD:
+        enough = np.abs(torque[:, worst]).max() / ACTION_BOUND_RAD
+        warnings.warn(
+            f"the weight along the reference {config.reference.kind!r} bends joint {known.joint_names[worst]!r} by up "
+            f"to {needed[worst]:.3g} rad, and actions are cut at ±{ACTION_BOUND_RAD:g} rad: no policy can take all of "
+            f"it back. Spring and servo together need {enough:.3g} N·m/rad and have {stiffness[worst]:.3g}; give them "
+            "more, or choose poses with less load",
+            stacklevel=4,
         )
 
 

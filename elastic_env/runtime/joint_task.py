@@ -24,6 +24,7 @@ from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name, spring_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
+from elastic_env.runtime.at_rest import RestWatch
 from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
 from elastic_env.runtime.joint_config import JointConfig
 from elastic_env.runtime.metrics import Metric
@@ -264,6 +265,7 @@ class JointTask(Stateful):
         self._inputs = np.array([servo.id for servo in servos])
         self._integrators = np.array([servo.actadr[0] for servo in servos])
         self._noise, self._imu = NoiseStream(num_worlds, NOISE), _inertial_imu(config, plant, num_worlds)
+        self._rest_watch = RestWatch(plant.static_torque, plant.true.rest_stiffness(config.form), joints)
         self._reference = PlanTable(plant.motion, config.control_period_s, num_worlds)
         self._step = np.zeros(num_worlds, dtype=np.int64)
         self._present = self._coming = self._reference.at(self._step)
@@ -297,6 +299,7 @@ class JointTask(Stateful):
                 self._imu_bias[world] += self._imu.draw(world, generator, draws[world].noise())
         if scenario.stiffness_spread > 0.0:
             self._spread(simulation, worlds, draws)
+        self._rest_watch.restart(worlds)
         self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
         self._follow()
         self._offset[worlds] = self._offset_before[worlds] = 0.0
@@ -331,6 +334,8 @@ class JointTask(Stateful):
         self._step, self._diverged = self._step + 1, diverged
         self._present, self._coming = self._coming, self._reference.at(self._step + 1)
         self._read(simulation, ~diverged)
+        is_last = (self._coming.rest != self._present.rest) | (self._step >= self.num_steps)
+        self._rest_watch.see(self._present, is_last, self._state.q, self._offset)
         if self._imu is not None:
             self._imu.advance(~diverged, self._state.q[:, 0], self._state.q_dot[:, 0])
         before, self._measured = self._measured, self._measure(~diverged)

@@ -13,13 +13,14 @@ import mujoco
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.dynamics.tree.end_effector import outermost_body
 from elastic_env.joint.frozen import frozen, require_fixed_base
+from elastic_env.joint.joint_settings import GivenJoints
 from elastic_env.joint.model_file import compiled_spec
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot
 from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
 from elastic_env.robots.robot import ID, NAME
-from elastic_env.robots.robot.joints import GivenJoints, elastic_joints, home_of_joints, read_joints
+from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, home_of_joints
 from elastic_env.robots.robot.model import GivenModel, RigidModel, read_robot
 from elastic_env.runtime.joint_config import RewardWeights
 from elastic_env.runtime.joint_task import JointTask, stiffest
@@ -59,7 +60,7 @@ def configure_robot(
     Args:
         model: File of MJCF (.xml) or URDF (.urdf), the text of one, or a `mujoco.MjSpec`; without it and joints a
             made-up arm of four joints.
-        joints: YAML file or mapping of the elastic joints by name or pattern, see `elastic_env.robots.robot.joints`.
+        joints: YAML file or mapping of the elastic joints by name or pattern, see `elastic_env.joint.joint_settings`.
             All other joints are held where the model's first keyframe has them, or at its reference.
         reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind` and
             parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
@@ -99,7 +100,8 @@ def joint_robot(model: GivenModel, joints: GivenJoints, end_effector: str | None
     whole = compiled_spec(spec, "the model")
     require_fixed_base(whole)
     hinges = [whole.joint(j).name for j in range(whole.njnt) if whole.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    settings = read_joints(joints, hinges)
+    others = [whole.joint(j).name for j in range(whole.njnt) if whole.joint(j).name not in hinges]
+    settings = elastic_settings(joints, hinges, others)
     moving = frozen(spec, settings)
     names, rigid = list(settings), moving.copy().compile()
     mass = float(rigid.body_subtreemass[0])

@@ -1,26 +1,20 @@
 """The elastic joints of a robot: what is given by name or pattern, what the model says, and defaults for the rest."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from elastic_env.core.config import Model, quantity, read_mapping
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.tree.end_effector import outermost_body
 from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.frozen import home_of
-
-GivenJoints = str | Path | Mapping[str, Any]
-"""A YAML file, or a mapping from joint names or patterns to `JointSettings`, to K alone [N·m/rad], or to "held"."""
-HELD = "held"
-"""Value of a joint that a pattern names and that is not elastic all the same."""
+from elastic_env.joint.joint_settings import CURE, GivenJoints, JointSettings, ServoSettings, read_joints
+from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
 
 ROTOR_FREQUENCY_RAD_S = 100.0
 """An assumption for rotors that nobody knows: with the link blocked they swing on their spring at 16 Hz [rad/s]."""
@@ -28,119 +22,52 @@ DAMPING_RATIO = 0.17
 """Of rotor and link on the spring between them; about that of the testbed's joint, K 1001, B 0.839, D 10 [1]."""
 _SERVO_TO_SPRING = 50.0
 """k_p of a servo that nobody knows over K: stiff enough to add little to the deflection while its integrator acts."""
+_LEAST_SERVO_TO_SPRING, _SERVO_RAD_S = 5.0, 1000.0
+"""The same where the rotor is as light as its links: by the frequency of the rotor on its servo, at least 5 K."""
+_FASTEST_PER_S = 2500.0
+"""Rate of assumed dampers, which a physics step of 0.5 ms follows [1/s]."""
 _SPEED_LIMIT_RAD_S = 2.0 * np.pi
 """An assumption: position servos of arms turn about once a second."""
-_ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+DECAY_RATE_PER_S = 5.0
+"""At which links and servos come to rest, where nobody knows their damping: to 0.06 % within 1.5 s [1/s]."""
 _TORQUE_RESERVE, _RESERVE_RAD_S2 = 3.0, 20.0
 _POSES, _MASS_POSES = 200, 20
 
 
-class ServoSettings(Model):
-    """What is known of a servo; the rest comes from the model's actuator, or from defaults."""
+def elastic_settings(given: GivenJoints, hinges: Sequence[str], others: Sequence[str] = ()) -> dict[str, JointSettings]:
+    """Settings of the joints that move on springs, by name, in the order of the model.
 
-    position_gain: float | None = quantity(
-        "N·m/rad", None, gt=0, description="k_p; default that of the model's position actuator, else 50 K"
-    )
-    velocity_gain: float | None = quantity(
-        "N·m·s/rad", None, ge=0, description="k_v; default that of the actuator, else critical damping of the rotor"
-    )
-    integral_gain: float | None = quantity(
-        "N·m/(rad·s)",
-        None,
-        ge=0,
-        description="k_i; default 0 where the model has an actuator, which MuJoCo's have not, else k_p per second",
-    )
-    torque_limit: float | None = quantity(
-        "N·m",
-        None,
-        gt=0,
-        description="default the model's force range, else what holds three times the weight and gives 20 rad/s²",
-    )
-    speed_limit: float | None = quantity("rad/s", None, gt=0, description="no-load speed; default a turn a second")
-
-
-class JointSettings(Model):
-    """What is known of an elastic joint; all but K has a default."""
-
-    stiffness: float = quantity("N·m/rad", gt=0, description="K, stiffness of the transmission, without a default")
-    damping: float | None = quantity(
-        "N·m·s/rad", None, ge=0, description="D; default a damping ratio of 0.17 of rotor and link, as the testbed has"
-    )
-    rotor_inertia: float | None = quantity(
-        "kg·m²", None, gt=0, description="B; default the model's armature, where it has none K/(100 rad/s)², assumed"
-    )
-    coulomb_friction: float | None = quantity(
-        "N·m", None, ge=0, description="dry friction on the link; default the model's frictionloss"
-    )
-    viscous_friction: float | None = quantity(
-        "N·m·s/rad", None, ge=0, description="viscous friction on the link; default the model's damping of the joint"
-    )
-    backlash: float = quantity("rad", 0.0, ge=0, description="dead band; default none, as the scenario has one")
-    encoder_counts_per_turn: int | None = quantity(
-        "1", None, gt=0, description="motor encoder, counts per turn of the output; default continuous"
-    )
-    servo: ServoSettings = ServoSettings()
-
-
-def read_joints(given: GivenJoints, names: list[str]) -> dict[str, JointSettings]:
-    """Settings of the joints that are elastic, by name, in the order of the model.
-
-    A name goes before patterns, and a later pattern before an earlier one. Joints that nothing names, and those whose
-    value is "held", are left out.
+    Joints that nothing names, that are held, or that are rigid are left out: they stay at home.
 
     Args:
-        given: File or mapping.
-        names: Hinges of the model.
+        given: As of `read_joints`.
+        hinges: Hinges of the model.
+        others: Its further joints.
 
     Raises:
-        ConfigurationError: No file or mapping, a name or pattern of no hinge, or a value that cannot be.
+        ConfigurationError: As of `read_joints`; no joint is elastic; or a rigid joint has a servo that gives way.
     """
-    if not names:
+    if not hinges:
         raise ConfigurationError(
             "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
         )
-    mapping = _mapping(given)
-    for key in mapping:
-        if not isinstance(key, str) or not any(fnmatchcase(name, key) for name in names):
-            raise unknown_name("joint or pattern of joints", key, names)
     found: dict[str, JointSettings] = {}
-    for name in names:
-        fitting = [key for key in mapping if fnmatchcase(name, key)]
-        value = mapping[name if name in mapping else fitting[-1]] if fitting else HELD
-        if value != HELD:
-            found[name] = _settings(name, value)
+    for name, own in read_joints(given, hinges, others).items():
+        if own is None:
+            continue
+        gain = own.servo.sagging_gain(name)
+        if not own.is_rigid:
+            found[name] = own
+        elif np.isfinite(gain):
+            raise ConfigurationError(
+                f"joint {name!r} is rigid and its servo gives way, which is not simulated; give it a stiffness K "
+                f"[N·m/rad] far above its position_gain of {gain:g}, such as {1e3 * gain:g}"
+            )
     if not found:
         raise ConfigurationError(
-            f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(names)}, or '*' for all. {_CURE}"
+            f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(hinges)}, or '*' for all. {CURE}"
         )
     return found
-
-
-def _mapping(given: GivenJoints) -> Mapping[str, Any]:
-    if isinstance(given, Mapping):
-        return given
-    if not isinstance(given, str | Path):
-        raise ConfigurationError(
-            f"joints must be a YAML file or a mapping such as {{'*': {{'stiffness': 1000}}}}, got {shown(given)}. "
-            f"{_CURE}"
-        )
-    return read_mapping(Path(given))
-
-
-_CURE = (
-    "K has no default. `elastic identify --robot MODEL --log poses.csv` identifies it from static poses and writes a "
-    "file for `joints`; `elastic identify --robot MODEL --plan 20` proposes poses"
-)
-
-
-def _settings(name: str, value: Any) -> JointSettings:
-    own = value if isinstance(value, Mapping) else {"stiffness": value}
-    if own.get("stiffness") is None:
-        raise ConfigurationError(f"joint {name!r} needs its stiffness K [N·m/rad]. {_CURE}")
-    try:
-        return JointSettings(**dict(own))
-    except ConfigurationError as error:
-        raise ConfigurationError(f"joint {name!r}: {error}") from None
 
 
 def elastic_joints(
@@ -154,35 +81,52 @@ def elastic_joints(
         load_kg: Load on the outermost body that servos of unknown limits have to be good for [kg].
 
     Raises:
-        ConfigurationError: An actuator of a joint is no position servo and none is given in its place.
+        ConfigurationError: An actuator of a joint is no position servo and none is given in its place, or limits and
+            gains contradict each other.
+
+    Warns:
+        UserWarning: A value is assumed otherwise than by default, as the default is out of scale with the model.
     """
     model, names = spec.copy().compile(), list(settings)
     poses, links = drawn_poses(model, names), TreeTorque(model, names)
     links.set_load(model.body(outermost_body(model)).id, load_kg, np.zeros(3))
     torque = np.abs(links.gravity_torque(poses)).max(axis=0)
-    least, most = _inertias(model, names, poses)
-    return {
-        name: _elastic(model, name, own, _Links(*map(float, of_links)))
-        for (name, own), *of_links in zip(settings.items(), torque, least, most, strict=True)
-    }
+    inertias = _inertias(model, names, poses)
+    found: dict[str, ElasticJoint] = {}
+    said: list[str] = []
+    for (name, own), *of_links in zip(settings.items(), torque, *inertias, strict=True):
+        joint = _Assumed(model, name, own, _Links(*map(float, of_links)))
+        found[name] = joint.elastic()
+        said += joint.said
+    if said:
+        warnings.warn(f"assumed, as neither `joints` nor the model says it: {'; '.join(said)}", stacklevel=4)
+    return found
 
 
 @dataclass(frozen=True)
 class _Links:
-    """What a joint moves, over poses: largest torque at rest [N·m], least inertia of free links and most of held ones.
+    """What a joint moves, over poses; inertias are without rotors.
 
-    The inertias are without armature [kg·m²].
+    Attributes:
+        torque: Largest torque at rest [N·m].
+        least: Least inertia about the joint, where the other joints are free [kg·m²].
+        most: Largest inertia about it, where the others are held [kg·m²].
+        together: Largest inertia about it, where all joints turn by the same angle, to whatever side [kg·m²].
     """
 
     torque: float
     least: float
     most: float
+    together: float
 
 
-def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Array, Array]:
-    """Least and most inertia as `_Links` has them, (n,) each [kg·m²]."""
+def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Array, Array, Array]:
+    """Least and most inertia, and that of all together, as `_Links` has them, (n,) each [kg·m²]."""
     data, at = mujoco.MjData(model), [int(model.joint(name).id) for name in names]
-    dofs, least, most = model.jnt_dofadr[at], np.full(len(names), np.inf), np.zeros(len(names))
+    dofs, rotors = model.jnt_dofadr[at], np.diag([rotor_inertia(model, name) for name in names])
+    least = np.full(len(names), np.inf)
+    most = np.zeros(len(names))
+    together = np.zeros(len(names))
     mass = np.empty((model.nv, model.nv))
     for pose in poses[:_MASS_POSES]:
         data.qpos[model.jnt_qposadr[at]] = pose
@@ -190,96 +134,115 @@ def _inertias(model: mujoco.MjModel, names: list[str], poses: Array) -> tuple[Ar
         mujoco.mj_comPos(model, data)
         mujoco.mj_crb(model, data)
         mujoco.mj_fullM(model, data, mass)
-        links = mass[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs])
+        links = mass[np.ix_(dofs, dofs)] - rotors
         least = np.minimum(least, 1.0 / np.diag(np.linalg.inv(links)))
         most = np.maximum(most, np.diag(links))
-    return least, most
+        together = np.maximum(together, np.abs(links).sum(axis=1))
+    return least, most, together
 
 
-def _elastic(model: mujoco.MjModel, name: str, own: JointSettings, links: _Links) -> ElasticJoint:
-    dof = int(model.joint(name).dofadr[0])
-    K = own.stiffness
-    B = _first(own.rotor_inertia, float(model.dof_armature[dof]) or None, K / ROTOR_FREQUENCY_RAD_S**2)
-    return ElasticJoint(
-        stiffness=K,
-        rotor_inertia=B,
-        damping=_first(own.damping, 2.0 * DAMPING_RATIO * np.sqrt(K * B * links.least / (B + links.least))),
-        coulomb_friction=_first(own.coulomb_friction, float(model.dof_frictionloss[dof])),
-        viscous_friction=_first(own.viscous_friction, float(model.dof_damping[dof])),
-        backlash=own.backlash,
-        encoder_counts_per_turn=own.encoder_counts_per_turn,
-        servo=_servo(model, name, own.servo, (K, B), links),
-    )
+class _Assumed:
+    """One elastic joint from what is given, what the model says, and assumptions within the scale of the model.
 
-
-def _servo(model: mujoco.MjModel, name: str, own: ServoSettings, rotor: tuple[float, float], links: _Links) -> Servo:
-    """The servo of a joint whose K and B are given."""
-    K, B = rotor
-    found = ServoSettings() if own.position_gain is not None else _position_actuator(model, name)
-    kp = _first(own.position_gain, found.position_gain, _SERVO_TO_SPRING * K)
-    enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (B + links.most)
-    limits = [found.torque_limit, _force_limit(model, name)]
-    modelled = min((value for value in limits if value is not None), default=None)
-    return Servo(
-        position_gain=kp,
-        velocity_gain=_first(own.velocity_gain, found.velocity_gain, 2.0 * np.sqrt(kp * B)),
-        integral_gain=_first(own.integral_gain, found.integral_gain, kp),
-        torque_limit=_first(own.torque_limit, modelled, enough),
-        speed_limit=_first(own.speed_limit, _SPEED_LIMIT_RAD_S),
-    )
-
-
-def _actuators(model: mujoco.MjModel, name: str) -> list[int]:
-    """Actuators that act on a joint."""
-    joint = model.joint(name).id
-    return [
-        i for i in range(model.nu) if model.actuator_trntype[i] in _ON_JOINT and model.actuator_trnid[i, 0] == joint
-    ]
-
-
-def _position_actuator(model: mujoco.MjModel, name: str) -> ServoSettings:
-    """What the model's position actuator of a joint says, by its gear on the joint; nothing where there is none.
-
-    Raises:
-        ConfigurationError: There are several, or it has a law that a `Servo` has not.
+    Attributes:
+        said: Assumptions that the default would not lead one to expect, with their values.
     """
-    position = [i for i in _actuators(model, name) if model.actuator_biasprm[i, 1] != 0.0]
-    if not position:
-        return ServoSettings()  # a motor or a velocity servo: a position servo takes its place
-    i, gear = position[0], float(model.actuator_gear[position[0], 0])
-    gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
-    is_pid = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_PID
-    kp, kv, ki = -float(bias[1]), -float(bias[2]), float(gain[0]) if is_pid else 0.0
-    is_filtered = not is_pid and model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE
-    is_plain = is_pid or (model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED and np.isclose(gain[0], kp))
-    if len(position) > 1 or is_filtered or not is_plain or bias[0] != 0.0 or kp <= 0.0 or kv < 0.0:
-        raise ConfigurationError(
-            f"the actuators of joint {name!r} are no single position servo of the form kp (u - q) - kv q_dot; say its "
-            "position_gain, velocity_gain and integral_gain under `servo` of this joint in `joints`"
+
+    def __init__(self, model: mujoco.MjModel, name: str, own: JointSettings, links: _Links) -> None:
+        self._model, self._name, self._own, self._links = model, name, own, links
+        self._dof = int(model.joint(name).dofadr[0])
+        self.said: list[str] = []
+
+    def elastic(self) -> ElasticJoint:
+        """The joint.
+
+        Raises:
+            ConfigurationError: See `elastic_joints`.
+        """
+        own, damping = self._own, float(self._model.dof_damping[self._dof])
+        is_given = own.servo.position_gain is not None
+        actuator = None if is_given else position_servo(self._model, self._name)
+        if actuator is not None and own.servo.velocity_gain is None:
+            damping -= actuator.joint_damping
+        servo = own.servo.over(ServoSettings() if actuator is None else actuator.settings)
+        known = own.rotor_inertia or rotor_inertia(self._model, self._name) or None
+        rotor = self._rotor_inertia(servo.velocity_gain or 0.0) if known is None else known
+        ratio = self._servo_to_spring(rotor) if known is None else _SERVO_TO_SPRING
+        return ElasticJoint(
+            stiffness=own.stiffness,
+            rotor_inertia=rotor,
+            damping=_first(own.damping, self._damping(rotor)),
+            coulomb_friction=_first(own.coulomb_friction, float(self._model.dof_frictionloss[self._dof])),
+            viscous_friction=_first(own.viscous_friction, damping),
+            backlash=own.backlash,
+            encoder_counts_per_turn=own.encoder_counts_per_turn,
+            servo=self._servo(servo, rotor, ratio, is_given),
         )
-    return ServoSettings(
-        position_gain=gear**2 * kp, velocity_gain=gear**2 * kv, integral_gain=gear**2 * ki,
-        torque_limit=_bound(abs(gear), model.actuator_forcelimited[i], model.actuator_forcerange[i]),
-    )  # fmt: skip
 
+    def _rotor_inertia(self, velocity_gain: float) -> float:
+        """B of a rotor that nobody knows: by its frequency on the spring, and no more than its links have.
 
-def _force_limit(model: mujoco.MjModel, name: str) -> float | None:
-    """What the joint, or a motor that a servo replaces, can deliver [N·m]; None where the model does not say it."""
-    joint = model.joint(name).id
-    found = [_bound(1.0, model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint])]
-    for i in _actuators(model, name):
-        gear = abs(float(model.actuator_gear[i, 0]))
-        found.append(_bound(gear, model.actuator_forcelimited[i], model.actuator_forcerange[i]))
-        if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE and model.actuator_dyntype[i] == 0:
-            gain = abs(float(model.actuator_gainprm[i, 0]))
-            found.append(_bound(gear * gain, model.actuator_ctrllimited[i], model.actuator_ctrlrange[i]))
-    return min((value for value in found if value is not None), default=None)
+        A servo of a known velocity gain needs a rotor that is not too light for it.
+        """
+        by_frequency = self._own.stiffness / ROTOR_FREQUENCY_RAD_S**2
+        most = max(self._links.most, velocity_gain / _FASTEST_PER_S)
+        if by_frequency <= most:
+            return by_frequency
+        scale = "its links have" if most == self._links.most else "its velocity gain needs"
+        self.said.append(
+            f"rotor_inertia of {self._name} {most:.3g} kg·m², as much as {scale}, as K/(100 rad/s)² would be "
+            f"{by_frequency:.3g}"
+        )
+        return most
 
+    def _servo_to_spring(self, rotor: float) -> float:
+        """k_p over K of a servo that nobody knows, on a rotor whose inertia is assumed."""
+        K = self._own.stiffness
+        if rotor == K / ROTOR_FREQUENCY_RAD_S**2:
+            return _SERVO_TO_SPRING
+        return min(max(rotor * _SERVO_RAD_S**2 / K, _LEAST_SERVO_TO_SPRING), _SERVO_TO_SPRING)
 
-def _bound(scale: float, is_limited: bool, interval: Array) -> float | None:
-    """The smaller end of an interval about zero, where it is a limit and not empty."""
-    value = scale * float(np.abs(interval).min())
-    return value if is_limited and value > 0.0 else None
+    def _damping(self, rotor: float) -> float:
+        r"""D of a transmission that nobody knows [N·m·s/rad].
+
+        Rotor and lightest links swing with the damping ratio of the testbed's. All links that swing together come to
+        rest, too: with :math:`m_j = \sum_i |M_{ji}|` every mode of the links on their springs has :math:`\varphi^T M
+        \varphi \le \sum_j m_j \varphi_j^2`, so that :math:`D_j \ge 2 \sigma m_j` lets it decay by :math:`\sigma`.
+        A soft spring is damped critically at most, and light links no faster than a physics step follows.
+        """
+        K, least, together = self._own.stiffness, self._links.least, self._links.together
+        of_lightest = DAMPING_RATIO * np.sqrt(K * rotor * least / (rotor + least))
+        of_slowest = min(DECAY_RATE_PER_S * together, np.sqrt(K * together))
+        fastest = _FASTEST_PER_S / 2.0 * rotor * least / (rotor + least)
+        return float(2.0 * max(of_lightest, min(of_slowest, fastest)))
+
+    def _servo(self, known: ServoSettings, rotor: float, ratio: float, is_given: bool) -> Servo:
+        """The servo of which some is known."""
+        links = self._links
+        kp = _first(known.position_gain, ratio * self._own.stiffness)
+        kv = known.velocity_gain
+        if kv is None and known.position_gain is None:
+            kv = 2.0 * np.sqrt(kp * rotor)
+        elif kv is None:  # softer than the spring, it carries the links as well
+            kv = 2.0 * float(np.sqrt(kp * (rotor + links.most)))
+            if not is_given:
+                self.said.append(
+                    f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping of rotor and links, as "
+                    "nothing in the model damps its servo"
+                )
+        enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
+        limit = known.torque_limit
+        if limit is None:
+            limit = force_limit(self._model, self._name)
+        # an integrator lets go of what it gathered in a motion at the rate k_i/k_p, which Routh bounds by k_v/(B + M)
+        rate = min(DECAY_RATE_PER_S, kv / (4.0 * (rotor + links.most)))
+        return Servo(
+            position_gain=kp,
+            velocity_gain=kv,
+            integral_gain=_first(known.integral_gain, rate * kp),
+            torque_limit=_first(limit, enough),
+            speed_limit=_first(known.speed_limit, _SPEED_LIMIT_RAD_S),
+        )
 
 
 def _first(*values: float | None) -> float:
