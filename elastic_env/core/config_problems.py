@@ -125,7 +125,7 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
     requirement = _bounds(model, path) or _KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be "))
-    return Problem(path, "must", f"must be {requirement}{_unit(model, path)}, got {given}")
+    return Problem(path, "must", f"must be {requirement}{_unit(model, path)}, got {given}{_meaning(model, path)}")
 
 
 _KINDS = {
@@ -171,6 +171,14 @@ def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
 def _number(bound: float) -> str:
     """A bound, whole ones with all their digits."""
     return f"{bound:d}" if isinstance(bound, int) else f"{bound:.6g}"
+
+
+def _meaning(model: type[BaseModel], path: ParameterPath) -> str:
+    """What a parameter is, in brackets; empty where its description is more than one line."""
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    if field is None or not field.description or not isinstance(field.json_schema_extra, dict):
+        return ""
+    return f" ({field.description.rpartition(' [')[0]})"
 
 
 def _unit(model: type[BaseModel], path: ParameterPath) -> str:

@@ -74,6 +74,18 @@ def shown(value: Any) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
+def shortened(text: object) -> str:
+    """Text of a user's, such as a path, as an error shows it without quotes: at most 200 characters."""
+    return _cut(str(text))
+
+
+def _cut(text: str) -> str:
+    if len(text) <= _LONGEST_SHOWN:
+        return text
+    end = _LONGEST_SHOWN // 4
+    return f"{text[: _LONGEST_SHOWN - end - 3]}...{text[-end:]}"
+
+
 def unknown_name(kind: str, name: object, choices: Iterable[str]) -> ConfigurationError:
     """The error for a name that does not exist, listing those that do.
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from math import isfinite, nan
 from pathlib import Path
 
 from rich.console import Console
@@ -13,7 +14,8 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.environments import environment
 from train.evaluate.progress import read_progress
-from train.learn.train_config import CONSTANTS, TrainConfig
+from train.learn.algorithm_options import CONSTANTS
+from train.learn.train_config import TrainConfig
 from train.learn.trainer import Trainer
 from train.runs.folders import CONFIG, locked, locked_part, require_name, run_folder
 from train.runs.progress import Show, show_progress
@@ -215,4 +217,7 @@ def _table(config: TrainConfig, folder: Path) -> Table:
 
 
 def _change(base: float, mine: float, scale: float) -> str:
-    return f"{scale * base:.2f} → {scale * mine:.2f} ({100.0 * (mine / base - 1.0):+.0f} %)"
+    """Two scores and the change between them; - for one of which all episodes failed."""
+    both = " → ".join(f"{scale * score:.2f}" if isfinite(score) else "-" for score in (base, mine))
+    change = mine / base - 1.0 if base else nan
+    return f"{both} ({100.0 * change:+.0f} %)" if isfinite(change) else both
