@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
-from elastic_env.core.errors import ConfigurationError, choices_listed, shown
+from elastic_env.core.errors import ConfigurationError, choices_listed, readable, shown
 
 ParameterPath = tuple[str | int, ...]
 """Where a value stands: the keys and numbers of entries that lead to it."""
@@ -74,7 +74,7 @@ class ModelError(ConfigurationError):
 
     def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
         """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
-        sentences = list(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
+        sentences = list(dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems))
         lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
         fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
         said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]

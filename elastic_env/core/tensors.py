@@ -6,7 +6,7 @@ from typing import Any
 import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 
 _MOST_BYTES = 100_000_000
 _FILE_TYPES = ("F32", "F64")
@@ -20,7 +20,9 @@ def read_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
-            raise ConfigurationError(f"{path} must have at most {_MOST_BYTES} bytes, it has {path.stat().st_size}")
+            raise ConfigurationError(
+                f"{shortened(path)} must have at most {_MOST_BYTES} bytes, it has {path.stat().st_size}"
+            )
         with safe_open(path, framework="np") as file:
             for name in file.keys():  # noqa: SIM118  no mapping
                 if (kind := file.get_slice(name).get_dtype()) not in _FILE_TYPES:
@@ -30,5 +32,5 @@ def read_tensors(path: Path) -> dict[str, npt.NDArray[Any]]:
             return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise ConfigurationError(
-            f"{path} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
+            f"{shortened(path)} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
         ) from None

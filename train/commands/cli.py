@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from elastic_env.core.errors import shortened
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
@@ -86,6 +87,14 @@ def _ended_by(*numbers: int) -> Iterator[None]:
 
 
 def _command(arguments: list[str] | None) -> Any:
+    given = sys.argv[1:] if arguments is None else arguments
+    short = [shortened(argument).replace("\n", " ") for argument in given]
+    if short != given:
+        _parsed(short)  # what is wrong with them is said without a flood
+    return _parsed(given)
+
+
+def _parsed(arguments: list[str]) -> Any:
     return tyro.cli(
         Command, prog="elastic", args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from baselines.policies import is_saved
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, load_yaml, quantity
-from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shown
+from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shortened, shown
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
 from train.evaluate.changes import changes, merged
@@ -304,7 +304,9 @@ def recorded(folder: Path, trust_code: bool = False) -> CompareConfig:
     """
     file = folder / CONFIG
     if not file.is_file():
-        raise ConfigurationError(f"{folder} is no run: it has no {CONFIG}; name the folder that compare wrote")
+        raise ConfigurationError(
+            f"{shortened(folder)} is no run: it has no {CONFIG}; name the folder that compare wrote"
+        )
     config = load_yaml(file, CompareConfig)
     for name in (config.env, *(policy.name for policy in config.policies)):
         if ":" in name and not is_saved(name) and not trust_code:
@@ -324,7 +326,9 @@ def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[
             yield folder
         return
     if not (output / CONFIG).is_file():
-        raise ConfigurationError(f"{output} is no run: it has no {CONFIG}; name the folder that compare wrote")
+        raise ConfigurationError(
+            f"{shortened(output)} is no run: it has no {CONFIG}; name the folder that compare wrote"
+        )
     with locked(output):
         describe(output, content, config.seed)
         yield output

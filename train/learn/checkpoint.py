@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from elastic_env.core.errors import ElasticError
+from elastic_env.core.errors import ElasticError, shortened
 from train.runs.whole import flush
 
 _DIGESTS = "sha256.json"
@@ -73,7 +73,7 @@ def require_whole(checkpoint: Path) -> None:
 def damaged(checkpoint: Path, why: object) -> ElasticError:
     """The error of a checkpoint that cannot be gone on with."""
     return ElasticError(
-        f"the checkpoint {checkpoint} is damaged or not whole ({why}); remove it to begin this seed anew"
+        f"the checkpoint {shortened(checkpoint)} is damaged or not whole ({why}); remove it to begin this seed anew"
     )
 
 

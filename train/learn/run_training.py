@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from elastic_env.core.config import load_yaml
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shortened
 from train.evaluate.environments import environment
 from train.evaluate.progress import read_progress
 from train.learn.algorithm_options import CONSTANTS
@@ -95,7 +95,9 @@ def resume(
 def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
     """The configuration of a run that is gone on with."""
     if not (folder / CONFIG).is_file():
-        raise ConfigurationError(f"{folder} is no training run: it has no {CONFIG}; name the folder that train printed")
+        raise ConfigurationError(
+            f"{shortened(folder)} is no training run: it has no {CONFIG}; name the folder that train printed"
+        )
     config = load_yaml(folder / CONFIG, TrainConfig)
     for what, name in (("an algorithm", config.algorithm), ("a robot", config.env)):
         if ":" in name and not trust_code:
