@@ -32,6 +32,7 @@ from train.report.robots_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import CONFIG, describe, locked, run_folder
 from train.runs.kinds import is_a
+from train.runs.warned import each_once
 from train.workers.places import HERE, Place
 
 _MOST_CELLS = 10_000
@@ -235,6 +236,7 @@ class Work:
     fresh: bool = False
 
 
+@each_once()
 def compare(
     config: CompareConfig, console: Console, output: Path | None = None, work: Work | None = None, report: bool = True
 ) -> Comparison:

@@ -116,7 +116,8 @@ def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
             said = f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
             console.print(said, soft_wrap=True)
     calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
-    with show_progress(console, {call.name: call.run.config.decisions for call in calls}) as show:
+    totals = {call.name: call.run.config.decisions for call in calls}
+    with show_progress(console, totals, unit="decisions") as show:
         if place == ONE_BY_ONE:
             for number, call in enumerate(calls):
                 _train_seed(call.run.config, call.seed, call.run.folder, 0, partial(show, number))
