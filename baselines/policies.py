@@ -19,7 +19,7 @@ from baselines.catalogue import (
 from baselines.compensation.policy import Policy
 from baselines.options import PolicyOptions
 from baselines.residual.residual import RESIDUAL, read_description, residual_policy
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError, shortened, unknown_name
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel, read_stiffness
 
 ITERATIVE = "iterative:"
@@ -129,11 +129,13 @@ def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     description = read_description(folder)
     task = env.unwrapped.task.name
     if description.robot != task:
-        raise ConfigurationError(f"{folder} is a residual for the {description.robot}, the environment is the {task}")
+        raise ConfigurationError(
+            f"{shortened(folder)} is a residual for the {description.robot}, the environment is the {task}"
+        )
     joints = env.unwrapped.assumed_model.joint_names
     if description.joints not in ([], joints):
         raise ConfigurationError(
-            f"{folder} was trained on a robot with the joints {', '.join(description.joints)}; "
+            f"{shortened(folder)} was trained on a robot with the joints {', '.join(description.joints)}; "
             f"the environment's has {', '.join(joints)}"
         )
     base = make(description.base, env, **{**description.base_options, **options})

@@ -658,12 +658,31 @@ def test_words_are_whole_where_there_are_two_residuals() -> None:
     rows = [
         row for row in changes([base, *family([[1.0], [3.0]], "payload"), *others]) if row.is_family and row.is_judged
     ]
-    for width, is_whole in ((84, True), (64, False)):
+    for width, has_room in ((84, True), (64, False)):
         console = Console(width=width, record=True, file=StringIO())
         print_changes(rows, console)
         text = console.export_text()
-        assert ({"learned", "residual", "reference", "scenario", "payload"} <= set(text.split())) == is_whole
+        assert {"learned", "residual", "reference", "scenario", "payload"} <= set(text.split())
         assert "0/2 (0/1)" in text  # the last column
+        assert ("no room for ZMP deviation rms; statistics.csv has them" in text) != has_room
+
+
+@pytest.mark.parametrize("width", [80, 72, 60, 50])
+def test_no_word_of_the_table_of_one_residual_is_broken(width: int) -> None:
+    """Catches mixtu/re and sprea/d on a terminal of the usual width."""
+    rows = []
+    for scenario in ("spread", "payload"):
+        base = cell("base", {"all": [2.0] * 10}, scenario)
+        rows += [base, *family([[0.1 * seed] * 10 for seed in range(1, 12)], scenario)]
+    shown = changes(rows, {"mixture of both": ["spread", "payload"]})
+    console = Console(width=width, record=True, file=StringIO())
+    print_changes(shown, console)
+    lines = console.export_text().splitlines()
+    assert {"scenario", "mixture", "spread", "payload", "learned"} <= {
+        word.strip(":,") for line in lines for word in line.split()
+    }
+    assert all("/" in line for line in lines if "spread" in line or "payload" in line)  # falls stand in the same line
+    assert max(map(len, lines)) <= width
 
 
 def test_groups_name_scenarios_that_are_played() -> None:

@@ -235,14 +235,14 @@ def test_what_is_missing_is_said_with_its_cure(tmp_path: Path, monkeypatch: pyte
     """Catches a traceback of files where the extra is not installed."""
     with pytest.raises(ConfigurationError, match=r"unknown robot 'pandas'.*'panda'"):
         gallery_robot("pandas")
-    with pytest.raises(ConfigurationError, match=r"no model at .*pip install 'elastic-env\[robots\]'"):
+    with pytest.raises(ConfigurationError, match=r"no model at .*pip install .*'\.\[robots\]'"):
         gallery_robot("panda", tmp_path)
 
     def missing(_: str) -> None:
         raise PackageNotFoundError
 
     monkeypatch.setattr(gallery, "distribution", missing)
-    with pytest.raises(ConfigurationError, match=r"package example-robot-data; .*pip install 'elastic-env\[robots\]'"):
+    with pytest.raises(ConfigurationError, match=r"package example-robot-data; .*pip install .*'\.\[robots\]'"):
         gallery_robot("panda")
 
 

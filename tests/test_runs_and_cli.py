@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -42,6 +43,7 @@ from train.experiments.play import play
 from train.report.pages.cells import read_rows
 from train.runs.folders import new_run, run_folder
 from train.runs.progress import show_progress
+from train.runs.warned import each_once, said_so_far
 from train.speed.contenders import RawWorlds, ScalarLoop, VectorLoop
 
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
@@ -843,6 +845,32 @@ def test_name_of_a_run_cannot_leave_its_folder(tmp_path: Path) -> None:
     for name in ("../escape", "/tmp/escape", ""):
         with pytest.raises(ConfigurationError, match="name"):
             CompareConfig(name=name)
+
+
+def test_progress_names_what_its_percents_are_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches 50 %: 0 of 16, which counts control steps before the colon and cells behind it."""
+    clock, console = [0.0], Console(file=StringIO())
+    monkeypatch.setattr(time, "monotonic", lambda: clock[-1])
+    with show_progress(console, {"all": 100}, unit="control steps") as show:
+        for now, done in [(1.0, 10), (11.0, 50)]:
+            clock.append(now)
+            show(0, done, "0 of 16 cells done, 8 running, 0 failed")
+    said = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert said[-1] == "  50 % of the control steps, about 10 s to go; 0 of 16 cells done, 8 running, 0 failed"
+
+
+def test_a_warning_is_shown_once() -> None:
+    """Catches a line of warning for every cell and every process of a comparison."""
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        with each_once(["said before"]):
+            for text in ("said before", "3 meshes are missing", "3 meshes are missing", "another"):
+                warnings.warn(text, stacklevel=1)
+            with each_once():
+                warnings.warn("another", stacklevel=1)
+            assert said_so_far() == {"said before", "3 meshes are missing", "another"}
+        warnings.warn("another", stacklevel=1)
+    assert [str(warning.message) for warning in shown] == ["3 meshes are missing", "another", "another"]
 
 
 def test_where_there_is_no_terminal_progress_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Training of residuals: resumed against uninterrupted to the last bit, states, mixtures, and what is refused."""
 
 import csv
+import itertools
 import os
 import shutil
 import signal
@@ -10,11 +11,13 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 import yaml
 from gymnasium.vector import AutoresetMode
 from rich.console import Console
@@ -31,7 +34,9 @@ from train.evaluate.evaluate import evaluate, make_vector_env
 from train.evaluate.progress import read_progress
 from train.experiments.bench import BenchCase
 from train.learn.constant_search import ConstantSearch
+from train.learn.curves import Curves
 from train.learn.mixed_env import MixedVectorEnv, threads_of_each
+from train.learn.run_training import _change as change_in_words
 from train.learn.run_training import resume
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.scores import played_together
@@ -49,6 +54,16 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 PPO = {"algorithm_options": {"n_steps": 8, "batch_size": 16, "n_epochs": 2}, "anneal": True}
 SAC = {"algorithm": "SAC", "algorithm_options": {"learning_starts": 32, "batch_size": 16, "gradient_steps": 1}}
+
+
+def options(**given: Any) -> dict[str, Any]:
+    """A configuration's options of its algorithm."""
+    return {"algorithm_options": given}
+
+
+def network(**given: Any) -> dict[str, Any]:
+    """The same, of its network."""
+    return options(policy_kwargs=given)
 
 
 def some_worlds(robot: str = "testbed", n: int = 3, scenario: str = "nominal", **options: Any) -> Any:
@@ -107,8 +122,107 @@ def test_a_resumed_training_ends_with_the_weights_of_an_uninterrupted_one(
     for name, tensor in one.items():
         np.testing.assert_array_equal(tensor, other[name], err_msg=name)
     events = EventAccumulator(str(tmp_path / "whole" / "tensorboard")).Reload()
-    assert {"rollout/ep_rew_mean", "train/learning_rate"} <= set(events.Tags()["scalars"])
+    assert {"rollout/reward_per_decision", "train/learning_rate"} <= set(events.Tags()["scalars"])
+    assert "rollout/ep_rew_mean" not in events.Tags()["scalars"]
     assert (tmp_path / "whole" / "progress.csv").read_bytes() == (tmp_path / "part" / "progress.csv").read_bytes()
+
+
+def test_curves_say_how_much_better_than_the_base_a_policy_is(tmp_path: Path) -> None:
+    """Catches a curve that falls while the error does, and one of another figure than progress.csv has."""
+    Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).run()
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    shown = {event.step: event.value for event in events.Scalars("eval/link_error_rms_rad_change")}
+    rows = read_progress(tmp_path)
+    assert shown == {
+        row["decisions"]: pytest.approx(row["link_error_rms_rad"] / row["base_link_error_rms_rad"] - 1.0, abs=1e-7)
+        for row in rows
+    }
+    assert [event.value for event in events.Scalars("eval/failed")] == [0.0] * len(rows)
+
+
+def test_the_reward_per_decision_counts_whole_episodes(tmp_path: Path) -> None:
+    """Catches a mean over the sums of episodes, which is the better the shorter they are."""
+    model = SimpleNamespace(ep_info_buffer=[{"r": -100.0, "l": 10}, {"r": -20.0, "l": 5}])
+    curves = Curves(str(tmp_path), model, SB3VecEnv(wrapped()))
+    curves.record("rollout/ep_rew_mean", -60.0)
+    curves.dump(7)
+    curves.close()
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert events.Tags()["scalars"] == ["rollout/reward_per_decision"]
+    ((step, value),) = [(event.step, event.value) for event in events.Scalars("rollout/reward_per_decision")]
+    assert (step, value) == (7, -8.0)
+
+
+def test_an_episode_that_is_cut_short_has_no_statistics() -> None:
+    """Catches first episodes, which are cut and of the beginning of the motion, in a mean with whole ones."""
+    worlds = SB3VecEnv(wrapped(n=4), np.random.default_rng(0))
+    worlds.reset()
+    lengths = []
+    for _ in range(120):
+        worlds.step_async(np.zeros((4, 1)))
+        infos = worlds.step_wait()[3]
+        lengths += [(info.get("episode") or {}).get("l") for info in infos if info]
+    assert lengths[:3] == [None, None, None]
+    assert set(lengths[3:]) == {max(length for length in lengths if length)}
+
+
+def spoilt(worlds: SB3VecEnv, after: int, part: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a step after some others return nan as its observation (0) or its reward (1)."""
+    step, count = worlds.env.step, itertools.count()
+
+    def spoil(actions: Any) -> Any:
+        result = list(step(actions))
+        if next(count) == after:
+            result[part] = np.full_like(result[part], np.nan)
+        return tuple(result)
+
+    monkeypatch.setattr(worlds.env, "step", spoil)
+
+
+@pytest.mark.parametrize(("part", "quantity"), [(0, "the observation"), (1, "the reward")])
+def test_nan_ends_a_training_with_one_sentence(
+    part: int, quantity: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Catches a traceback of torch, a checkpoint that holds nan, and one that is lost."""
+    training = Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path)
+    spoilt(training._worlds, 20, part, monkeypatch)
+    message = rf"{quantity} is not a finite number at decision 8\d of training seed 1; the checkpoint of decision 64 is"
+    with pytest.raises(ElasticError, match=message):
+        training.run()
+    assert Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path).done == 64
+
+
+@pytest.mark.parametrize(
+    ("base", "mine", "said"),
+    [
+        (0.002, 0.001, "2.00 → 1.00 (-50 %)"),
+        (0.002, np.nan, "2.00 → -"),
+        (np.nan, 0.001, "- → 1.00"),
+        (np.nan, np.nan, "- → -"),
+        (0.0, 0.001, "0.00 → 1.00"),
+    ],
+)
+def test_scores_without_an_episode_are_a_dash(base: float, mine: float, said: str) -> None:
+    """Catches nan → nan (+nan %)."""
+    assert change_in_words(base, mine, 1e3) == said
+
+
+def test_weights_that_are_nan_are_named(tmp_path: Path) -> None:
+    """Catches hours of a training whose network is nan."""
+    training = Training(TrainConfig(**{**SMALL, **PPO}), 1, tmp_path)
+    with torch.no_grad():
+        training.model.policy.log_std.fill_(np.nan)
+    with pytest.raises(ElasticError, match=r"log_std of the network is not a finite number.*no checkpoint was due"):
+        training.run()
+
+
+def test_a_search_whose_reward_is_nan_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Catches a search that is told nan and goes anywhere."""
+    search = ConstantSearch(TrainConfig(**SEARCH), 0, tmp_path)
+    step = search._worlds.step
+    monkeypatch.setattr(search._worlds, "step", lambda given: (lambda r: (r[0], r[1] * np.nan, *r[2:]))(step(given)))
+    with pytest.raises(ElasticError, match="the reward is not a finite number"):
+        search.run()
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
@@ -530,9 +644,23 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
         ({"weights": {"nominal": -1.0}}, "greater than 0"),
         ({"base": "residual:x"}, "no residual itself, got 'residual:x'"),
         ({"base": "zero"}, "acts on deflection, which Zero does not have.*command"),
-        ({"algorithm_options": {"foo": 1}}, "PPO cannot be built with algorithm_options .*foo"),
-        ({"algorithm_options": {"policy_kwargs": {"activation_fn": "Foo"}}}, "PPO cannot be built .*Foo"),
-        ({"algorithm_options": {"learning_rate": "x"}}, "PPO cannot be built .*'x'"),
+        ({"weights": {"nominal": 1e200}}, "weights.nominal must be less than or equal to 1000000, got 1e\\+200"),
+        ({"env_options": {"reward": {"link_error": 1e200}}}, r"link_error must be .* <= 1e\+06 \[1/rad\], got 1e\+200"),
+        ({"algorithm_options": {"foo": 1}}, "unknown parameter of algorithm_options 'foo'; choose one of: .*n_steps"),
+        (network(activation_fn="Foo"), "policy_kwargs.activation_fn must be 'Tanh' or 'ReLU', got 'Foo'"),
+        (network(log_std_init=1e9), r"policy_kwargs.log_std_init must be .*>= -20 and <= 2, got 1000000000.0 \(log"),
+        (network(net_arch=[64, 10**9]), r"net_arch: must be a list .*<= 4096.*, got \[64, 1000000000\]"),
+        (options(learning_rate="x"), "algorithm_options.learning_rate must be .*> 0 and <= 1, got 'x' .step"),
+        (options(learning_rate=1e30), r"algorithm_options.learning_rate must be .*<= 1, got 1e\+30 \(step"),
+        (options(device="cuda"), "leave out 'device': training runs on the CPU"),
+        (options(policy="MlpPolicy"), "leave out 'policy': .*policy_kwargs"),
+        (options(env="walker"), "leave out 'env': "),
+        (options(seed=3), "leave out 'seed': .*seeds"),
+        (options(verbose=1), "leave out 'verbose': "),
+        (options(tensorboard_log="x"), "leave out 'tensorboard_log': .*folder of the training seed"),
+        ({"algorithm": "m:C", **options(device="cuda")}, "leave out 'device'"),
+        ({"algorithm": "SAC", **options(ent_coef="auot")}, "ent_coef: must be the weight .* got 'auot'"),
+        ({"algorithm": "A2C", **options(batch_size=8)}, "unknown parameter of algorithm_options 'batch_size'"),
         ({"seeds": [0, 1, 0]}, r"can stand but once, got \[0, 1, 0\]"),
     ],
 )
@@ -580,8 +708,9 @@ def test_a_candidate_that_falls_comes_last(monkeypatch: pytest.MonkeyPatch, tmp_
     [
         ({"worlds": 7}, "each of 8 candidates in each scenario, 8, got worlds: 7"),
         ({"algorithm_options": {"popsize": 8}}, "'popsize'.*population_size"),
-        ({"algorithm_options": {"population_size": 0}}, "population_size >= 2 and a sigma > 0, got 0 and 0.3"),
-        ({"algorithm_options": {"sigma": "wide"}}, "CMA-ES cannot be built .*'wide'"),
+        (options(population_size=0), "population_size must be a whole number >= 2 and <= 100000, got 0"),
+        (options(sigma=0), "sigma must be a finite number > 0 and <= 2, got 0"),
+        (options(sigma="wide"), "sigma must be a finite number > 0 and <= 2, got 'wide'"),
     ],
 )
 def test_a_search_that_cannot_be_says_why(changes: dict[str, Any], message: str, tmp_path: Path) -> None:

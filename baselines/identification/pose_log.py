@@ -13,7 +13,7 @@ from typing import Literal, NoReturn
 
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, shortened, shown, unknown_name
 from elastic_env.core.signals import Array
 
 Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
@@ -157,7 +157,9 @@ def _columns(path: Path) -> dict[str, Array]:
 def _rows(path: Path) -> list[list[str]]:
     """Lines of the file that are not empty."""
     if not path.is_file():
-        raise ConfigurationError(f"no log at {path}; give a CSV file of static poses, see docs/identification.md")
+        raise ConfigurationError(
+            f"no log at {shortened(path)}; give a CSV file of static poses, see docs/identification.md"
+        )
     if path.stat().st_size > _LARGEST_BYTES:
         raise ConfigurationError(f"{path} must have at most {_LARGEST_BYTES} bytes, it has {path.stat().st_size}")
     try:

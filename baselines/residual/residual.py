@@ -21,7 +21,7 @@ from baselines.residual.network import Network, Tensors
 from baselines.residual.residual_kernels import count_due, count_step
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
@@ -243,7 +243,7 @@ def load_residual(folder: Path) -> tuple[ResidualDescription, Network]:
     try:
         network = Network(description, tensors)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{folder / WEIGHTS} holds no network: {error}") from None
+        raise ConfigurationError(f"{shortened(folder / WEIGHTS)} holds no network: {error}") from None
     found = sha256(content).hexdigest()
     if description.weights_sha256 not in (None, found):
         raise ConfigurationError(

@@ -16,8 +16,9 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
 from elastic_env.core.config_problems import ModelError, problems_of
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, listed, shortened, shown
 from elastic_env.core.files import read_bounded
+from elastic_env.core.installed import configurations_are
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.yaml_text import LARGEST_TEXT, NO_TEXT, parse_yaml
 
@@ -141,9 +142,9 @@ def load_yaml(path: str | Path, model: type[ModelT], changes: Mapping[str, Any] 
     try:
         return model(**{**content, **(changes or {})})
     except ModelError as error:
-        raise ConfigurationError(f"in {file}: {error.named()}") from None
+        raise ConfigurationError(f"in {shortened(file)}: {error.named()}") from None
     except ConfigurationError as error:
-        raise ConfigurationError(f"in {file}: {error}") from None
+        raise ConfigurationError(f"in {shortened(file)}: {error}") from None
 
 
 def load_json(
@@ -168,13 +169,13 @@ def load_json(
     except OSError as error:
         raise ConfigurationError(missing(str(error.strerror))) from None
     except ValueError as error:
-        raise ConfigurationError(f"{path} is not JSON: {error}") from None
+        raise ConfigurationError(f"{shortened(path)} is not JSON: {error}") from None
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{path} must be a mapping, got {type(content).__name__}")
+        raise ConfigurationError(f"{shortened(path)} must be a mapping, got {type(content).__name__}")
     try:
         return model(**content)
     except ModelError as error:
-        raise ConfigurationError(f"{path} describes no {what}: {error.named()}") from None
+        raise ConfigurationError(f"{shortened(path)} describes no {what}: {error.named()}") from None
 
 
 def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
@@ -190,12 +191,14 @@ def read_mapping(file: Path, empty: bool = False) -> dict[str, Any]:
     try:
         content = parse_yaml(_text_of(file))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{file} is not valid YAML: {error}") from None
+        raise ConfigurationError(f"{shortened(file)} is not valid YAML: {error}") from None
     if content is None and empty:
         content = {}
     if not isinstance(content, dict):
         got = "an empty file" if content is None else type(content).__name__
-        raise ConfigurationError(f"{file} must hold a mapping of parameters, such as 'name: value', got {got}")
+        raise ConfigurationError(
+            f"{shortened(file)} must hold a mapping of parameters, such as 'name: value', got {got}"
+        )
     return content
 
 
@@ -207,11 +210,11 @@ def _text_of(file: Path) -> str:
     """
     try:
         if file.is_dir():
-            raise ConfigurationError(f"{file} is a folder, a YAML file is needed")
+            raise ConfigurationError(f"{shortened(file)} is a folder, a YAML file is needed")
         if not file.exists():
             known = sorted(str(p) for p in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
-            listing = f"; found beside it: {', '.join(known)}" if known else ""
-            raise ConfigurationError(f"no configuration file at {shown(str(file))[1:-1]}{listing}")
+            listing = f"; found beside it: {listed(known)}" if known else configurations_are(file)
+            raise ConfigurationError(f"no configuration file at {shortened(file)}{listing}")
         return read_bounded(file, _BYTES * LARGEST_TEXT).decode("utf-8")
     except OSError as error:
-        raise ConfigurationError(f"{shown(str(file))} cannot be read: {error.strerror}") from None
+        raise ConfigurationError(f"{shortened(file)} cannot be read: {error.strerror}") from None

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
-from elastic_env.core.errors import ConfigurationError, choices_listed, shown
+from elastic_env.core.errors import ConfigurationError, choices_listed, readable, shown
 
 ParameterPath = tuple[str | int, ...]
 """Where a value stands: the keys and numbers of entries that lead to it."""
@@ -74,7 +74,7 @@ class ModelError(ConfigurationError):
 
     def named(self, of_all: str = "", spelt: Callable[[ParameterPath], str] = dotted) -> str:
         """All problems, one per line, in the words of who wrote a file or options; arguments as `Problem.sentence`."""
-        sentences = list(dict.fromkeys(problem.sentence(of_all, spelt) for problem in self.problems))
+        sentences = list(dict.fromkeys(readable(problem.sentence(of_all, spelt)) for problem in self.problems))
         lengths = itertools.accumulate(len(sentence) + 1 for sentence in sentences)
         fitting = max(sum(length <= _LONGEST_SAID for length in lengths), 1)
         said = [sentence[:_LONGEST_SAID] for sentence in sentences[: min(fitting, _MOST_SAID)]]
@@ -125,7 +125,7 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
     requirement = _bounds(model, path) or _KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be "))
-    return Problem(path, "must", f"must be {requirement}{_unit(model, path)}, got {given}")
+    return Problem(path, "must", f"must be {requirement}{_unit(model, path)}, got {given}{_meaning(model, path)}")
 
 
 _KINDS = {
@@ -171,6 +171,14 @@ def _bounds(model: type[BaseModel], path: ParameterPath) -> str:
 def _number(bound: float) -> str:
     """A bound, whole ones with all their digits."""
     return f"{bound:d}" if isinstance(bound, int) else f"{bound:.6g}"
+
+
+def _meaning(model: type[BaseModel], path: ParameterPath) -> str:
+    """What a parameter is, in brackets; empty where its description is more than one line."""
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    if field is None or not field.description or not isinstance(field.json_schema_extra, dict):
+        return ""
+    return f" ({field.description.rpartition(' [')[0]})"
 
 
 def _unit(model: type[BaseModel], path: ParameterPath) -> str:

@@ -1,9 +1,18 @@
 """Errors that teach: what was required, what was given, and which choices exist."""
 
 import difflib
+import itertools
+import re
 import reprlib
 from collections.abc import Collection, Iterable
 from typing import Any, ClassVar
+
+from elastic_env.core.installed import install_command
+
+_LONGEST_SHOWN = 200
+"""Characters of a user's text in an error."""
+_LONGEST_LINE, _LONGEST_LIST = 2000, 1000
+"""Characters of a line, and of names that are listed in it."""
 
 
 class ElasticError(ValueError):
@@ -11,9 +20,14 @@ class ElasticError(ValueError):
 
     Attributes:
         exit_code: What the command `elastic` ends with: 2 for a wrong input, 3 where the system failed.
+
+    A word or a quoted text of more than 200 characters is shortened, since it is a user's.
     """
 
     exit_code: ClassVar[int] = 2
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*(readable(arg) if isinstance(arg, str) else arg for arg in args))
 
 
 class SystemFailedError(ElasticError):
@@ -34,16 +48,13 @@ class ResultsExistError(ElasticError):
     """An output folder already holds results, which are never overwritten."""
 
 
-class MissingExtraError(ElasticError):
+class MissingExtraError(ConfigurationError):
     """A command needs a package of an optional extra that is not installed."""
 
 
 def missing_extra(package: str, extra: str, purpose: str) -> MissingExtraError:
     """The error for an optional package that is not there, with the command that installs it."""
-    return MissingExtraError(
-        f"{purpose} needs the package {package}; in the checkout of elastic-env install it with: "
-        f"pip install -c constraints.txt '.[{extra}]'"
-    )
+    return MissingExtraError(f"{purpose} needs the package {package}; install it with: {install_command(extra)}")
 
 
 class _Shown(reprlib.Repr):
@@ -64,14 +75,38 @@ class _Shown(reprlib.Repr):
         return repr(x) if len(x) <= self.maxstring else super().repr_str(x, level)
 
 
-_LONGEST_SHOWN = 240
 _SHOWN = _Shown()
 
 
 def shown(value: Any) -> str:
-    """A given value as an error shows it: its representation, shortened where that would flood the terminal."""
-    text = _SHOWN.repr(value)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
+    """A given value as an error shows it: its representation, at most 200 characters."""
+    return shortened(_SHOWN.repr(value))
+
+
+def shortened(text: object, longest: int = _LONGEST_SHOWN) -> str:
+    """Text of a user's as an error shows it without quotes, such as a path: its begin and end, where it is long.
+
+    Args:
+        text: It.
+        longest: Characters that are shown.
+    """
+    whole = str(text)
+    if len(whole) <= longest:
+        return whole
+    end = longest // 4
+    return f"{whole[: longest - end - 3]}...{whole[-end:]}"
+
+
+_LONG = re.compile(rf"(?<!\w)'[^'\n]{{{_LONGEST_SHOWN},}}'(?!\w)|\S{{{_LONGEST_SHOWN + 1},}}")
+"""A quoted text or a word that is a user's by its length."""
+
+
+def readable(text: str) -> str:
+    """A message without words, quoted texts or lines that would flood a terminal."""
+    if len(text) <= _LONGEST_SHOWN:
+        return text
+    short = _LONG.sub(lambda found: shortened(found[0]), text)
+    return "\n".join(shortened(line, _LONGEST_LINE) for line in short.split("\n"))
 
 
 def unknown_name(kind: str, name: object, choices: Iterable[str]) -> ConfigurationError:
@@ -100,5 +135,14 @@ def choices_listed(name: object, choices: Iterable[str]) -> str:
     """The names that exist, and the one that is closest to what was given."""
     known = list(choices)
     close = difflib.get_close_matches(name[:_LONGEST_SHOWN], known, n=1) if isinstance(name, str) else []
-    hint = f" Did you mean {close[0]!r}?" if close else ""
-    return f"choose one of: {', '.join(known)}.{hint}"
+    hint = f" Did you mean {shown(close[0])}?" if close else ""
+    return f"choose one of: {listed(known)}.{hint}"
+
+
+def listed(names: Iterable[object]) -> str:
+    """Names as an error lists them: the first ones, and how many more there are."""
+    known = [shortened(name) for name in names]
+    lengths = itertools.accumulate(len(name) + 2 for name in known)
+    fitting = max(sum(length <= _LONGEST_LIST for length in lengths), 1)
+    more = f" and {len(known) - fitting} more" if fitting < len(known) else ""
+    return f"{', '.join(known[:fitting])}{more}"

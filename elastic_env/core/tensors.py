@@ -7,7 +7,7 @@ import numpy.typing as npt
 from safetensors import SafetensorError, deserialize
 from safetensors.numpy import load
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.files import read_bounded
 
 _MOST_BYTES = 100_000_000
@@ -31,5 +31,5 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
         return load(content), content
     except (OSError, SafetensorError) as error:
         raise ConfigurationError(
-            f"{path} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
+            f"{shortened(path)} cannot be read: it is missing, cut short or something else ({error}); copy it anew"
         ) from None

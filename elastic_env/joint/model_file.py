@@ -5,7 +5,7 @@ from pathlib import Path
 
 import mujoco
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 
 _LARGEST_BYTES = 50_000_000
 _CURES = {
@@ -51,7 +51,7 @@ def xml_of(path: Path) -> ET.Element:
         ConfigurationError: There is no such file, it is too large, or it is no XML.
     """
     if not path.is_file():
-        raise ConfigurationError(f"no model at {path}; give a file of MJCF (.xml) or URDF (.urdf)")
+        raise ConfigurationError(f"no model at {shortened(path)}; give a file of MJCF (.xml) or URDF (.urdf)")
     if path.stat().st_size > _LARGEST_BYTES:
         raise ConfigurationError(f"{path} must have at most {_LARGEST_BYTES} bytes, it has {path.stat().st_size}")
     try:

@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.interpolate import CubicSpline
 
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity
-from elastic_env.core.errors import ConfigurationError, require_known, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known, shortened, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.motion.inverse_kinematics import joint_path
@@ -280,7 +280,9 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
         ConfigurationError: It cannot be read, or a column or value is not what it has to be.
     """
     if not file.is_file():
-        raise ConfigurationError(f"no file of angles at {file}; give a CSV file with the column time_s and joints")
+        raise ConfigurationError(
+            f"no file of angles at {shortened(file)}; give a CSV file with the column time_s and joints"
+        )
     if file.stat().st_size > _LARGEST_BYTES:
         raise ConfigurationError(f"{file} must have at most {_LARGEST_BYTES} bytes, it has {file.stat().st_size}")
     try:

@@ -18,7 +18,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, require_known
+from elastic_env.core.errors import missing_extra, require_known
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
@@ -119,18 +119,15 @@ def gallery_file(name: str, folder: Path | None = None) -> Path:
         return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / file.name
     path = (folder or _package_folder(name)) / file
     if not path.is_file():
-        raise ConfigurationError(f"the robot {name!r} has no model at {path}; {_CURE}")
+        raise missing_extra(_PACKAGE, "robots", f"the robot {name!r}, which has no model at {path},")
     return path
-
-
-_CURE = "install the robots by pip install 'elastic-env[robots]'"
 
 
 def _package_folder(name: str) -> Path:
     try:
         return Path(str(distribution(_PACKAGE).locate_file(_SHARE)))
     except PackageNotFoundError:
-        raise ConfigurationError(f"the robot {name!r} is of the package {_PACKAGE}; {_CURE}") from None
+        raise missing_extra(_PACKAGE, "robots", f"the robot {name!r}") from None
 
 
 def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -> mujoco.MjSpec:

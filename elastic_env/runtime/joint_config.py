@@ -16,9 +16,9 @@ from elastic_env.runtime.scenario import WALKER_FIELDS, Scenario, make_scenario,
 class RewardWeights(Model):
     """Weights of the reward terms; every term is a penalty that grows without saturating."""
 
-    link_error: float = quantity("1/rad", 100.0, ge=0, description="per rad of link error: 1 at 0.01 rad")
-    command_rate: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offset")
-    divergence: float = quantity("1", 200.0, ge=0, description="once, where the simulation diverges")
+    link_error: float = quantity("1/rad", 100.0, ge=0, le=1e6, description="per rad of link error: 1 at 0.01 rad")
+    command_rate: float = quantity("s/rad", 0.1, ge=0, le=1e6, description="per rad/s of change of the offset")
+    divergence: float = quantity("1", 200.0, ge=0, le=1e6, description="once, where the simulation diverges")
 
 
 class JointConfig(Model):

@@ -23,6 +23,7 @@ from train.evaluate.evaluate import (
 )
 from train.runs.failures import DEFECT, explained
 from train.runs.progress import Show, plain_progress, show_progress
+from train.runs.warned import each_once, said_so_far
 from train.workers.calls import Outcome, Tally, Watch, run_calls
 from train.workers.places import HERE, Place
 
@@ -117,7 +118,9 @@ class _Playing:
 
     def results(self) -> list[Outcome | None]:
         """Outcomes in the order of the conditions; None for those that Ctrl-C kept from starting."""
-        with show_progress(self._console, {"control steps": sum(self._steps)}, transient=True) as self._show:
+        unit = "control steps"
+        totals = {unit: sum(self._steps)}
+        with show_progress(self._console, totals, transient=True, unit=unit) as self._show:
             if len(self._batches) == 1 and self._place.is_local:  # a process of its own takes seconds to start
                 cells = _evaluate(self._of(0), lambda played: self._reported(0, played), self._place.jobs)
                 self._ended(0, Outcome(cells))
@@ -133,7 +136,9 @@ class _Playing:
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
             with self._place.opened(len(self._batches), folder) as pool:
-                run_calls(_evaluate, [(self._of(batch),) for batch in range(len(self._batches))], pool, watch)
+                said = said_so_far()
+                given = [(self._of(batch), said) for batch in range(len(self._batches))]
+                run_calls(_evaluate_beside, given, pool, watch)
 
     def _reported(self, batch: int, played: int) -> None:
         self._played[batch] = played
@@ -219,6 +224,14 @@ def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluati
         say(done / total)
 
     return evaluate(condition, advance)
+
+
+def _evaluate_beside(
+    conditions: Sequence[Condition], said: frozenset[str], report: Callable[[int], None]
+) -> list[Outcome]:
+    """Evaluations in a process of their own, without the warnings that were shown before."""
+    with each_once(said):
+        return _evaluate(conditions, report)
 
 
 def _evaluate(conditions: Sequence[Condition], report: Callable[[int], None], num_threads: int = 1) -> list[Outcome]:

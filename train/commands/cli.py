@@ -15,6 +15,7 @@ import tyro
 from rich.text import Text
 
 import elastic_env
+from elastic_env.core.errors import shortened
 from train.commands.guarding import Bench, Speed
 from train.commands.hardware import Hardware
 from train.commands.learning import Export, Iterate, Train
@@ -87,9 +88,17 @@ def _ended_by(*numbers: int) -> Iterator[None]:
 
 
 def _command(arguments: list[str] | None) -> Any:
-    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+    given = sys.argv[1:] if arguments is None else arguments
+    if given == ["--version"]:
         print(f"elastic-env {elastic_env.__version__}")
         sys.exit()
+    short = [shortened(argument).replace("\n", " ") for argument in given]
+    if short != given:
+        _parsed(short)  # what is wrong with them is said without a flood
+    return _parsed(given)
+
+
+def _parsed(arguments: list[str]) -> Any:
     return tyro.cli(
         Command, prog="elastic", args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),

@@ -251,7 +251,7 @@ class Robot:
 
     Example, one K for all hinges: elastic robot arm.xml --stiffness 1000
 
-    Example, an arm of the gallery (pip install 'elastic-env[robots]'): elastic robot panda
+    Example, an arm of the gallery (extra robots): elastic robot panda
     """
 
     model: Annotated[str, tyro.conf.Positional]

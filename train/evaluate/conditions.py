@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, field_validator
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.runtime.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
@@ -41,7 +41,7 @@ def _refuse(taken: set[str], what: str) -> None:
     """Refuse arguments of the environments that stand in the wrong place."""
     for name in sorted(taken):
         place = "the commands set it themselves" if name in UNPLACED else "it has a key, or an option, of its own"
-        raise ValueError(f"{name} cannot be {what}; {place}")
+        raise ValueError(f"{name} cannot be {what}; {shortened(place)}")
 
 
 GivenReference = Annotated[Any, AfterValidator(_reference)]

@@ -15,7 +15,7 @@ from typing import Any
 from baselines.catalogue import ASSUMED_OPTIONS
 from baselines.policies import RESIDUAL, best_analytic
 from baselines.residual.residual import DESCRIPTION, ResidualDescription, read_description, shipped
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 from train.evaluate.conditions import Member, PolicySpec
 from train.evaluate.environments import ENVIRONMENTS
 
@@ -159,7 +159,7 @@ def _require_motion(folder: Path, description: ResidualDescription) -> None:
     try:
         known.label(known.arguments(reference)[known.motion])
     except ConfigurationError as error:
-        raise ConfigurationError(f"{folder / DESCRIPTION}: training.config.reference: {error}") from None
+        raise ConfigurationError(f"{shortened(folder / DESCRIPTION)}: training.config.reference: {error}") from None
 
 
 def _nearest(pattern: Path) -> str:
@@ -189,7 +189,7 @@ def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, 
         for what in {**mine, **theirs}:
             if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
-                    f"{pattern!r} must match training seeds of one configuration, but {what} of {folder} is "
+                    f"{pattern!r} must match training seeds of one configuration, but {what} of {shortened(folder)} is "
                     f"{mine.get(what)!r} and of {first} {theirs.get(what)!r}; give each an entry of its own"
                 )
         if seed is None:
@@ -197,7 +197,9 @@ def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, 
                 f"{folder} does not say its training seed: residual.json has no training.seed and the path no seed_N"
             )
         if seed in seen:
-            raise ConfigurationError(f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and {folder}")
+            raise ConfigurationError(
+                f"{pattern!r} matches training seed {seed} twice: {seen[seed]} and {shortened(folder)}"
+            )
         seen[seed] = folder
 
 

@@ -33,6 +33,7 @@ from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import describe, locked, require_run, run_folder
 from train.runs.kinds import is_a
 from train.runs.user_code import code_refused, require_no_code
+from train.runs.warned import each_once
 from train.workers.places import HERE, Place
 
 _MOST_CELLS = 10_000
@@ -236,6 +237,7 @@ class Work:
     fresh: bool = False
 
 
+@each_once()
 def compare(
     config: CompareConfig, console: Console, output: Path | None = None, work: Work | None = None, report: bool = True
 ) -> Comparison:

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra
+from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra, shortened
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import blamed, make_policy, make_vector_env
 
@@ -108,7 +108,7 @@ def _window(episode: Iterator[int], period: float) -> None:
 
 def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Path, console: Console) -> None:
     if video.exists() or video.is_symlink():
-        raise ResultsExistError(f"{video} exists and is not overwritten; name another file")
+        raise ResultsExistError(f"{shortened(video)} exists and is not overwritten; name another file")
     if video.suffix not in {".mp4", ".gif"}:
         raise ElasticError(f"a video is an .mp4 or .gif file, got {video.name!r}")
     try:

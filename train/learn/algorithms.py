@@ -7,7 +7,7 @@ from typing import Any
 import stable_baselines3
 
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
-from train.learn.train_config import CONSTANTS
+from train.learn.algorithm_options import CONSTANTS
 from train.runs.user_code import named_object
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from elastic_env.core.errors import ElasticError
+from elastic_env.core.errors import ElasticError, shortened
 from elastic_env.core.files import flush, read_bounded
 from elastic_env.core.json_text import LARGEST_JSON
 
@@ -74,7 +74,7 @@ def require_whole(checkpoint: Path) -> None:
 def damaged(checkpoint: Path, why: object) -> ElasticError:
     """The error of a checkpoint that cannot be gone on with."""
     return ElasticError(
-        f"the checkpoint {checkpoint} is damaged or not whole ({why}); remove it to begin this seed anew"
+        f"the checkpoint {shortened(checkpoint)} is damaged or not whole ({why}); remove it to begin this seed anew"
     )
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from cmaes import CMA
 
 from baselines.residual.residual import ResidualDescription
-from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from train.learn.algorithms import options_named
+from train.learn.finite import require_finite
 from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
 from train.learn.trainer import Trainer
 
@@ -42,15 +42,8 @@ class ConstantSearch(Trainer):
 
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
         options = {**_DEFAULTS, **config.algorithm_options}
-        if options.keys() != _DEFAULTS.keys():
-            raise unknown_name("option of CMA-ES", (options.keys() - _DEFAULTS.keys()).pop(), _DEFAULTS)
         super().__init__(config, seed, folder, threads)
-        with options_named(config.algorithm, config.algorithm_options):
-            self._population, sigma = int(options["population_size"]), float(options["sigma"])
-        if self._population < 2 or not sigma > 0.0:
-            raise ConfigurationError(
-                f"CMA-ES needs a population_size >= 2 and a sigma > 0, got {self._population} and {sigma:g}"
-            )
+        self._population = options["population_size"]
         episodes = config.worlds // (len(config.scenarios) * self._population)
         if episodes == 0:
             needed = len(config.scenarios) * self._population
@@ -64,7 +57,7 @@ class ConstantSearch(Trainer):
         (num_constants,) = self._worlds.single_action_space.shape or (0,)
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
         self._optimiser = CMA(
-            mean=np.zeros(num_constants), sigma=sigma, bounds=bounds, seed=seed,
+            mean=np.zeros(num_constants), sigma=options["sigma"], bounds=bounds, seed=seed,
             population_size=self._population,
         )  # fmt: skip
         self._told: list[list[float]] = []
@@ -113,6 +106,7 @@ class ConstantSearch(Trainer):
         total, alive = np.zeros(n), np.ones(n, dtype=np.bool_)
         while alive.any():
             _, reward, terminated, truncated, _ = self._worlds.step(residuals)
+            require_finite("the reward", np.where(alive, reward, 0.0))
             total += np.where(alive, reward - _FALL_COST * terminated, 0.0)
             self._done += int(alive.sum())
             alive &= ~(terminated | truncated)

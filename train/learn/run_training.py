@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from math import isfinite, nan
 from pathlib import Path
 
 from rich.console import Console
@@ -12,7 +13,8 @@ from rich.table import Table
 from elastic_env.core.config import load_yaml
 from train.evaluate.environments import environment
 from train.evaluate.progress import read_progress
-from train.learn.train_config import CONSTANTS, TrainConfig
+from train.learn.algorithm_options import CONSTANTS
+from train.learn.train_config import TrainConfig
 from train.learn.trainer import Trainer
 from train.runs.folders import locked, locked_part, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
@@ -109,7 +111,8 @@ def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
             said = f"{run.folder} is complete; to learn for longer, start a new run with --decisions"
             console.print(said, soft_wrap=True)
     calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
-    with show_progress(console, {call.name: call.run.config.decisions for call in calls}) as show:
+    totals = {call.name: call.run.config.decisions for call in calls}
+    with show_progress(console, totals, unit="decisions") as show:
         if place == ONE_BY_ONE:
             for number, call in enumerate(calls):
                 _train_seed(call.run.config, call.seed, call.run.folder, 0, partial(show, number))
@@ -212,4 +215,7 @@ def _table(config: TrainConfig, folder: Path) -> Table:
 
 
 def _change(base: float, mine: float, scale: float) -> str:
-    return f"{scale * base:.2f} → {scale * mine:.2f} ({100.0 * (mine / base - 1.0):+.0f} %)"
+    """Two scores and the change between them; - for one of which all episodes failed."""
+    both = " → ".join(f"{scale * score:.2f}" if isfinite(score) else "-" for score in (base, mine))
+    change = mine / base - 1.0 if base else nan
+    return f"{both} ({100.0 * change:+.0f} %)" if isfinite(change) else both

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.state import Stateful
+from train.learn.finite import require_finite
 
 _NOTHING: dict[str, Any] = {}
 
@@ -19,6 +20,7 @@ class SB3VecEnv(Stateful, VecEnv):
 
     Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`: reward r, length l in
     steps of this environment, and the metrics of the task) are in the infos of the worlds that end, as SB3 reads them.
+    A first episode that is cut short has no statistics: it would count for less reward than a whole one.
 
     Args:
         env: With `autoreset_mode=SAME_STEP`, such as a `ResidualVectorWrapper`.
@@ -60,8 +62,14 @@ class SB3VecEnv(Stateful, VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
-        """One step in every world."""
+        """One step in every world.
+
+        Raises:
+            DivergedError: An observation or a reward is not finite.
+        """
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        require_finite("the reward", reward)
+        require_finite("the observation", observation)
         done = terminated | truncated
         self._reward += reward
         self._length += 1
@@ -71,16 +79,23 @@ class SB3VecEnv(Stateful, VecEnv):
             final = info["final_info"]
             metrics, scored = final.get("episode_metrics", {}), final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
+                own = {name: values[world].item() for name, values in metrics.items() if scored[world]}
                 infos[world] = {
                     "terminal_observation": info["final_obs"][world],
                     "TimeLimit.truncated": bool(truncated[world] and not terminated[world]),
-                    "episode": {"r": float(self._reward[world]), "l": int(self._length[world]), "t": 0.0},
-                    "episode_metrics": {
-                        name: values[world].item() for name, values in metrics.items() if scored[world]
-                    },
+                    "episode_metrics": own,
                 }
+                if own or self._stagger is None:
+                    reward_sum, length = float(self._reward[world]), int(self._length[world])
+                    infos[world]["episode"] = {"r": reward_sum, "l": length, "t": 0.0}
             self._reward[done], self._length[done] = 0.0, 0
         return observation, reward.astype(np.float32), done, infos
+
+    @property
+    def reward_per_decision(self) -> float | None:
+        """Mean reward of the steps of the present episodes; None before the first one."""
+        steps = int(self._length.sum())
+        return float(self._reward.sum()) / steps if steps else None
 
     def close(self) -> None:
         """Close the environment."""

@@ -22,6 +22,9 @@ from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
 
+_Scored = tuple[list[float], int]
+"""Means of metrics over the episodes of a scenario that did not fail, and how many did."""
+
 
 class Scores:
     """Evaluations and policies of a training seed.
@@ -36,15 +39,19 @@ class Scores:
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
         self._config, self._folder, self._threads = config, folder, threads
         self._provenance = provenance(seed)
-        self._base_scores: list[tuple[list[float], int]] | None = None
+        self._base_scores: list[_Scored] | None = None
         self.best = np.inf
         """Score of the best policy so far: mean ratio to the base, and what falls cost."""
 
-    def evaluate(self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> None:
+    def evaluate(self, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> dict[str, float]:
         """Score a policy after some decisions, and keep it where it is the best so far.
 
         A residual begins as its base, within a hundredth of its range: before the first decision the base's score
         is its own.
+
+        Returns:
+            METRIC_change of every judged metric: relative to the base's, [1], mean over the scenarios; negative is
+            better. One is left out where all episodes of a scenario failed. And `failed`: how many did.
         """
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
@@ -64,6 +71,9 @@ class Scores:
             self.best = score
             self.keep("best", decisions, policy)
         shutil.rmtree(current)
+        found = dict(zip(columns, _changes(scores, self._base_scores), strict=True))
+        known = {f"{name}_change": change for name, change in found.items() if np.isfinite(change)}
+        return {**known, "failed": float(sum(failed for _, failed in scores))}
 
     def keep(self, name: str, decisions: int, policy: tuple[dict[str, Any], ResidualDescription]) -> Path:
         """Write a policy as a folder, replacing the one of that name."""
@@ -88,7 +98,7 @@ class Scores:
             return
         write_whole(path, "".join([lines[0], *kept]))
 
-    def _played(self, policy: str, metrics: list[str]) -> list[tuple[list[float], int]]:
+    def _played(self, policy: str, metrics: list[str]) -> list[_Scored]:
         """For each scenario means of metrics over the episodes that did not fail, and how many did."""
         conditions = [self._config.condition(scenario, policy) for scenario in self._config.scenarios]
         results = played_together(conditions, metrics, self._threads)
@@ -96,6 +106,13 @@ class Scores:
             ([float(np.mean(some)) if len(some) else np.nan for some in result[~failed].T], int(failed.sum()))
             for result, failed in results
         ]
+
+
+def _changes(scores: Sequence[_Scored], base: Sequence[_Scored]) -> list[float]:
+    """Change of every metric relative to the base's, [1], mean over the scenarios."""
+    mine, theirs = (np.array([metrics for metrics, _ in scored]) for scored in (scores, base))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return [float(change) for change in (mine / theirs).mean(axis=0) - 1.0]
 
 
 def _append(path: Path, header: list[str], rows: list[list[Any]]) -> None:

@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Self
 
 from gymnasium.vector import AutoresetMode
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 import baselines
 from baselines.residual.residual import ResidualDescription, require_plain_base
@@ -14,13 +14,12 @@ from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.registration import require_memory
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import environment
+from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
 from train.runs.kinds import is_a
 
 FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
 """Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""
-CONSTANTS = "CMA-ES"
-"""Algorithm that searches constants instead of training a network."""
 TRAINING_SEED_STRIDE = 100_000
 """Distance of the episodes of two training seeds."""
 
@@ -37,8 +36,8 @@ class TrainConfig(Model):
     """Motion, as in a comparison; None for the environment's default."""
     scenarios: list[Title] = Field(default=["nominal"], min_length=1, max_length=MOST_ENTRIES)
     """Scenarios whose worlds are learned from together, in equal shares."""
-    weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = {}
-    """How much the rewards of single scenarios count; 1 where nothing is said."""
+    weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = {}
+    """How much the rewards of single scenarios count, at most 10⁶; 1 where nothing is said."""
     ranges: GivenRanges = {}
     """Intervals that the robots of `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}
@@ -85,10 +84,8 @@ class TrainConfig(Model):
 
     @field_validator("algorithm_options")
     @classmethod
-    def _policy_arguments_are_a_mapping(cls, options: dict[str, Any]) -> dict[str, Any]:
-        if not isinstance(options.get("policy_kwargs"), dict | None):
-            raise ValueError(f"policy_kwargs must be a mapping, got {shown(options['policy_kwargs'])}")
-        return options
+    def _options_are_within_their_bounds(cls, options: dict[str, Any], others: ValidationInfo) -> dict[str, Any]:
+        return checked_options(str(others.data.get("algorithm")), options)
 
     @field_validator("seeds")
     @classmethod

@@ -1,12 +1,14 @@
 """What all ways of learning have in common: the loop over decisions with evaluations and checkpoints on the way."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from baselines.residual.residual import ResidualDescription
+from elastic_env.core.errors import ElasticError, shortened
 from train.learn.checkpoint import damaged, recovered, require_whole, written
+from train.learn.finite import DivergedError
 from train.learn.scores import Scores
 from train.learn.train_config import TrainConfig
 
@@ -26,16 +28,25 @@ class Trainer(ABC):
 
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
         self.config, self.folder = config, folder
+        self._seed = seed
         self._scores = Scores(config, seed, folder, threads)
+        self._kept: int | None = None
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """Learn to the end of the configuration's decisions; `progress` is told the decisions done."""
+        """Learn to the end of the configuration's decisions; `progress` is told the decisions done.
+
+        Raises:
+            ElasticError: A quantity is no longer finite; the last checkpoint stays.
+        """
         config = self.config
         if self.done == 0:
             self._evaluate()
         while self.done < config.decisions:
             before = self.done
-            self._advance()
+            try:
+                self._advance()
+            except DivergedError as error:
+                raise ElasticError(self._diverged(error.quantity)) from error
             if config.is_due(config.evaluate_every, before, self.done):
                 self._evaluate()
             if config.is_due(config.checkpoint_every, before, self.done):
@@ -53,6 +64,7 @@ class Trainer(ABC):
         """Keep everything that the rest depends on."""
         with written(self.folder / CHECKPOINT) as fresh:
             self._write(fresh)
+        self._kept = self.done
 
     def _go_on(self) -> None:
         """Go on from the checkpoint, if there is one; the last step of making a trainer.
@@ -67,7 +79,18 @@ class Trainer(ABC):
                 self._read(path)
             except (KeyError, IndexError, TypeError, ValueError, RecursionError, RuntimeError) as error:
                 raise damaged(path, f"{type(error).__name__}: {error}") from error
+            self._kept = self.done
         self._scores.forget_after(self.done)
+
+    def _diverged(self, quantity: str) -> str:
+        """The sentence for a quantity that is no longer finite."""
+        kept = f"the checkpoint of decision {self._kept} is kept in {shortened(self.folder / CHECKPOINT)}"
+        if self._kept is None:
+            kept = f"no checkpoint was due yet (checkpoint_every: {self.config.checkpoint_every})"
+        return (
+            f"{quantity} is not a finite number at decision {self.done} of training seed {self._seed}; {kept}; "
+            f"begin anew with a smaller learning_rate or log_std_init, or smaller weights of the reward"
+        )
 
     @abstractmethod
     def _write(self, checkpoint: Path) -> None:
@@ -87,4 +110,7 @@ class Trainer(ABC):
 
     def _evaluate(self) -> None:
         """Score the present policy."""
-        self._scores.evaluate(self.done, self._policy())
+        self._show(self._scores.evaluate(self.done, self._policy()))
+
+    def _show(self, changes: Mapping[str, float]) -> None:  # noqa: B027  who has curves shows them
+        """Show the scores of an evaluation beside the curves of the training, see `Scores.evaluate`."""

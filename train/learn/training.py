@@ -10,14 +10,13 @@ import random
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
@@ -25,7 +24,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from baselines.residual.residual import ResidualDescription
 from elastic_env.core.state import given, taken
 from train.learn.algorithms import algorithm_class, options_named
+from train.learn.curves import Curves
 from train.learn.export import network_of
+from train.learn.finite import require_finite
 from train.learn.sb3_env import SB3VecEnv
 from train.learn.state import read_state, write_state
 from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
@@ -88,14 +89,16 @@ class Training(Trainer):
     @contextmanager
     def _curves(self) -> Iterator[None]:
         """Write TensorBoard's files of the work within. Its thread ends with it, whatever ended that."""
-        self.model.set_logger(configure(str(self.folder / "tensorboard"), ["tensorboard"]))
+        curves = Curves(str(self.folder / "tensorboard"), self.model, self._worlds)
+        self.model.set_logger(curves)
         try:
             yield
         except BaseException:
             with suppress(Exception):  # what ended the work is what is said
-                self.model.logger.close()
+                curves.close()
             raise
-        self.model.logger.close()
+        curves.finish(self.done)
+        curves.close()
 
     @property
     def done(self) -> int:
@@ -107,7 +110,18 @@ class Training(Trainer):
         if self.config.anneal:
             rate = self._learning_rate * (1.0 - before / self.config.decisions)
             self.model.lr_schedule = lambda _: rate
-        self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=1)
+        try:
+            self.model.learn(self._portion(), reset_num_timesteps=before == 0, log_interval=1)
+        except ValueError:  # of a distribution of torch whose parameters are nan, for one
+            self._require_finite_weights()
+            raise
+        self._require_finite_weights()
+
+    def _require_finite_weights(self) -> None:
+        for name, tensor in self.model.policy.state_dict().items():
+            require_finite(f"{name} of the network", tensor.numpy())
+        for name, rms in {"observations": self._normaliser.obs_rms, "returns": self._normaliser.ret_rms}.items():
+            require_finite(f"the variance of the {name}", rms.var)  # type: ignore[union-attr]
 
     def _write(self, checkpoint: Path) -> None:
         parameters = io.BytesIO()  # torch itself calls a full disk an internal error
@@ -216,6 +230,11 @@ class Training(Trainer):
         """The present policy, as it is exported."""
         tensors, activation, output = network_of(self.model, self._normaliser)
         return tensors, self.config.description(self._joints, activation=activation, output=output)
+
+    def _show(self, changes: Mapping[str, float]) -> None:
+        for name, change in changes.items():
+            self.model.logger.record(f"eval/{name}", change)
+        self.model.logger.dump(self.done)
 
     def _evaluate(self) -> None:
         """Score the present policy, without a trace in the random states of the training."""

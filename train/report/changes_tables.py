@@ -1,6 +1,6 @@
 """Paired changes as a table for the terminal and as CSV."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rich import box
@@ -19,8 +19,9 @@ from train.evaluate.changes import (
     by_line,
     signed_interval,
 )
+from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap
-from train.report.fitting import has_room
+from train.report.fitting import has_room, print_fitting
 from train.runs.escaping import write_csv
 
 
@@ -75,20 +76,42 @@ def _role(row: Change) -> str:
 
 
 def print_changes(rows: Sequence[Change], console: Console) -> None:
-    """Print the changes of the residuals, a line per cell; first against bases, then against rivals."""
+    """Print the changes of the residuals, a line per cell; first against bases, then against rivals.
+
+    Where there is little room, the title names the reference, and then the last metrics are left out.
+    """
     for is_rival in (False, True):
         shown = [row for row in rows if row.is_family and row.is_judged and row.is_rival == is_rival]
-        if shown:
-            table = changes_table(shown)
-            console.print(table if has_room(console, table) else changes_table(shown, breaks_words=True))
+        if not shown:
+            continue
+
+        def of(columns: Sequence[Column], shown: Sequence[Change] = shown) -> list[Change]:
+            return [row for row in shown if row.column in columns]
+
+        def table(columns: Sequence[Column], of: Callable[..., list[Change]] = of) -> Table:
+            usual = changes_table(of(columns))
+            return usual if has_room(console, usual) else changes_table(of(columns), reference_in_title=True)
+
+        def narrow(columns: Sequence[Column], of: Callable[..., list[Change]] = of) -> Table:
+            return changes_table(of(columns), breaks_words=True)
+
+        print_fitting(
+            console,
+            list(dict.fromkeys(row.column for row in shown)),
+            table,
+            title=lambda column: column.title,
+            file="statistics.csv",
+            narrow=narrow,
+        )
 
 
-def changes_table(rows: Sequence[Change], breaks_words: bool = False) -> Table:
+def changes_table(rows: Sequence[Change], breaks_words: bool = False, reference_in_title: bool = False) -> Table:
     """Changes of residuals against their bases, or against their rivals, a line per cell with all judged metrics.
 
     Args:
         rows: Changes of families, of one environment, all against bases or all against rivals.
         breaks_words: Whether names may be broken, where there is little room.
+        reference_in_title: Whether the title names the reference, if there is but one.
     """
     columns = list(dict.fromkeys(row.column for row in rows))
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
@@ -99,15 +122,24 @@ def changes_table(rows: Sequence[Change], breaks_words: bool = False) -> Table:
     marks = {mark for row in rows for mark in row.marks}
     signs = [f"{sign} {words}" for words, sign in _SIGNS.items() if any(mark.startswith(words) for mark in marks)]
     policies = list(dict.fromkeys(row.policy for row in rows))
-    named = ["residual"] if len(policies) > 1 else []  # else the title names it, which leaves room
-    whose = "" if named else f"{escape(policies[0])}: "
+    references = list(dict.fromkeys(row.reference for row in rows))
+    in_title = {"residual": len(policies) == 1, "reference": reference_in_title and len(references) == 1}
+    named = [name for name, is_in_title in in_title.items() if not is_in_title]
+    titled = [
+        text for text, is_in_title in zip((policies[0], references[0]), in_title.values(), strict=True) if is_in_title
+    ]
+    whose = f"{escape(', '.join(titled))}: " if titled else ""
     table = Table(
         title=f"{whose}change against {_opponent(rows)} on the same episodes, {over}",
         caption=". ".join([*signs, SIGNS_ARE]),
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0),
     )  # fmt: skip
-    words = {"residual": policies, "scenario": [row.scope + _signs(row) for row in rows]}
-    for name in (*named, "reference", "scenario", *swept):
+    words = {
+        "residual": policies,
+        "reference": references,
+        "scenario": [row.scope + _signs(row) for row in rows],
+    }
+    for name in (*named, "scenario", *swept):
         longest = max(len(word) for text in (name.replace("_", " "), *words.get(name, ())) for word in text.split())
         least = None if breaks_words else longest
         table.add_column(name.replace("_", "\n"), vertical="bottom", overflow="fold", min_width=least)
@@ -122,9 +154,10 @@ def changes_table(rows: Sequence[Change], breaks_words: bool = False) -> Table:
         first = line[0]
         if previous and previous[0] != first.policy:
             table.add_section()
-        names = (first.policy, first.reference)
-        shown = ("",) * (1 + len(named)) if names == previous else names[1 - len(named) :]
-        previous = names
+        own = (first.policy, first.reference)
+        of_names = {"residual": first.policy, "reference": first.reference}
+        shown = ["" if own == previous else of_names[name] for name in named]
+        previous = own
         values = {row.column: _figure(row) for row in line}
         table.add_row(
             *map(escape, shown), escape(first.scope) + _signs(first),

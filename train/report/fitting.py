@@ -18,6 +18,7 @@ def print_fitting(
     title: Callable[[T], str],
     file: str,
     stays: Callable[[T], bool] = lambda _: False,
+    narrow: Callable[[Sequence[T]], Table] | None = None,
 ) -> None:
     """Print a table without the last columns that the terminal has no room for, and name those and who has them.
 
@@ -28,11 +29,15 @@ def print_fitting(
         title: What a column is called where it is left out.
         file: File that has all of them.
         stays: Whether a column is only left out when all others are.
+        narrow: Makes the table where there is no room for one column either; its words may be broken. Where it is
+            given, the cells of `table` may be wrapped between words.
     """
     shown = list(columns)
-    while len(shown) > 1 and _width(table(shown), console) > console.width:
+    fits = _has_all_room if narrow is None else has_room
+    while len(shown) > 1 and not fits(console, table(shown)):
         shown.remove(next((column for column in reversed(shown) if not stays(column)), shown[-1]))
-    console.print(table(shown))
+    last = table(shown)
+    console.print(last if narrow is None or fits(console, last) else narrow(shown))
     if len(shown) < len(columns):
         titles = "; ".join(title(column) for column in columns if column not in shown)
         console.print(f"no room for {titles}; {file} has them", style="dim", markup=False)
@@ -43,9 +48,9 @@ def has_room(console: Console, table: Table) -> bool:
     return console.measure(table, options=_anything(console)).minimum <= console.width
 
 
-def _width(table: Table, console: Console) -> int:
-    """Width of a table with all of its text."""
-    return console.measure(table, options=_anything(console)).maximum
+def _has_all_room(console: Console, table: Table) -> bool:
+    """Whether a terminal has room for a table with all of its text."""
+    return console.measure(table, options=_anything(console)).maximum <= console.width
 
 
 def _anything(console: Console) -> ConsoleOptions:

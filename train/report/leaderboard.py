@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from baselines.catalogue import Track
-from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.errors import ConfigurationError, shortened
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
@@ -331,10 +331,10 @@ def read_leaderboard(path: Path) -> list[Standing]:
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != _HEAD:
-            raise ConfigurationError(f"{path} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}")
+            raise ConfigurationError(f"{shortened(path)} is no leaderboard.csv: its columns must be {', '.join(_HEAD)}")
         found = [_standing(row) for row in reader]
     if not found:
-        raise ConfigurationError(f"{path} has no rows")
+        raise ConfigurationError(f"{shortened(path)} has no rows")
     return found
 
 

@@ -23,6 +23,7 @@ _EXTRAS = {
     "report": ("matplotlib", "plotly", "jinja2", "imageio", "imageio_ffmpeg", "PIL"),
     "cluster": ("dask", "distributed", "submitit"),
     "hardware": ("dynamixel_sdk", "serial", "mscl"),
+    "robots": ("example_robot_data",),
 }
 _CURES = {
     errno.ENOSPC: "free some space; a run goes on with --resume",
@@ -43,7 +44,7 @@ def explained(error: BaseException) -> tuple[str, int] | None:
     """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
     if isinstance(error, ShadowedError):
         return str(error), WRONG_INPUT
-    from elastic_env.core.errors import ElasticError, missing_extra
+    from elastic_env.core.errors import ElasticError, missing_extra, shortened
 
     if is_interrupt(error):
         return "interrupted", 130
@@ -55,7 +56,7 @@ def explained(error: BaseException) -> tuple[str, int] | None:
         return "there is not enough memory; take fewer worlds or fewer --jobs", SYSTEM_FAILED
     for cause in _causes(error):
         if isinstance(cause, OSError) and cause.errno is not None:
-            place = f"{cause.filename}: " if cause.filename else ""
+            place = f"{shortened(cause.filename)}: " if cause.filename else ""
             cure = _CURES.get(cause.errno)
             return f"{place}{cause.strerror}" + (f"; {cure}" if cure else ""), SYSTEM_FAILED
     return None

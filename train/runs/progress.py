@@ -39,7 +39,7 @@ class Say(Protocol):
         """Say it: the share, from 0 to 1, and a note behind it."""
 
 
-def plain_progress(console: Console, least_s: float = 0.0) -> Say:
+def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -> Say:
     """A function that takes the share of the work that is done, and says each tenth of it in a line.
 
     Long work is announced early, with the time that it will take. A line with a note ends with the time to go.
@@ -49,6 +49,7 @@ def plain_progress(console: Console, least_s: float = 0.0) -> Say:
     Args:
         console: Where it says so.
         least_s: Shortest time between two lines, and before the first one [s].
+        unit: What is counted, such as control steps; a line with a note names it, since the note counts others.
     """
     said, when = 0, time.monotonic()
     first: tuple[float, float] | None = None  # processes take their time to start
@@ -67,7 +68,7 @@ def plain_progress(console: Console, least_s: float = 0.0) -> Say:
                 console.print(f"  about {duration(to_go)} to go")
         if int(10 * share) > said and time.monotonic() - when >= least_s:
             said, when = int(10 * share), time.monotonic()
-            more = f": {note}, about {duration(to_go)} to go" if note else ""
+            more = f" of the {unit}, about {duration(to_go)} to go; {note}" if note else ""
             console.print(f"  {10 * said} %{more}", soft_wrap=True)
 
     return say
@@ -82,19 +83,22 @@ def duration(seconds: float) -> str:
 
 
 @contextmanager
-def show_progress(console: Console, totals: Mapping[str, int], transient: bool = False) -> Iterator[Show]:
+def show_progress(
+    console: Console, totals: Mapping[str, int], transient: bool = False, unit: str = "work"
+) -> Iterator[Show]:
     """Show how far some tasks are: by a bar each on a terminal, by a line now and then where there is none.
 
     Args:
         console: Where it is shown.
         totals: What is to be done of every task, by its name.
         transient: Whether the bars vanish at the end.
+        unit: See `plain_progress`.
 
     Yields:
         A function that takes the number of a task, how much of it has been done, and a note.
     """
     if not console.is_terminal:
-        yield _lines(console, totals)
+        yield _lines(console, totals, unit)
         return
     columns = TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     noted = TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False)
@@ -108,8 +112,8 @@ def show_progress(console: Console, totals: Mapping[str, int], transient: bool =
         yield draw
 
 
-def _lines(console: Console, totals: Mapping[str, int]) -> Callable[..., None]:
-    say, done = plain_progress(console, _LEAST_S), [0] * len(totals)
+def _lines(console: Console, totals: Mapping[str, int], unit: str) -> Callable[..., None]:
+    say, done = plain_progress(console, _LEAST_S, unit), [0] * len(totals)
 
     def count(number: int, amount: int, note: str = "") -> None:
         done[number] = amount

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 
 _FILES = "elastic_user_file_"
 _REFUSED_IN: ContextVar[Path | None] = ContextVar("refused_in", default=None)
@@ -70,11 +70,13 @@ def named_object(name: str) -> Any:
     try:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(f"{place} cannot be imported: {type(error).__name__}: {error}") from error
+        raise ConfigurationError(f"{shortened(place)} cannot be imported: {type(error).__name__}: {error}") from error
     if not hasattr(module, attribute):
         _require_unshadowed(module, attribute)
         own = [f.__name__ for f in vars(module).values() if inspect.isfunction(f) and f.__module__ == module.__name__]
-        raise ConfigurationError(f"{place} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}")
+        raise ConfigurationError(
+            f"{shortened(place)} has no {attribute!r}; its functions are: {', '.join(own) or 'none'}"
+        )
     return getattr(module, attribute)
 
 
@@ -102,7 +104,7 @@ def _from_file(path: Path) -> ModuleType:
     if known is not None and known.__file__ == str(resolved):
         return known
     if not resolved.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
+        raise FileNotFoundError(f"there is no file {shortened(path)}")
     spec = importlib.util.spec_from_file_location(name, resolved)
     assert spec is not None
     assert spec.loader is not None

@@ -40,13 +40,13 @@ FALL_TILT_RAD = 0.4
 class WalkRewardWeights(Model):
     """Weights of the reward terms; every term is a penalty that grows without saturating."""
 
-    tilt: float = quantity("1/rad", 100.0, ge=0, description="per rad of pelvis error: 1 at 0.01 rad")
-    zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, description="per m of ZMP deviation: 1 at 0.03 m")
-    effort: float = quantity("1/(N·m)", 0.001, ge=0, description="per N·m of servo torque, rms over the joints")
-    smoothness: float = quantity("s/rad", 0.1, ge=0, description="per rad/s of change of the offsets, rms over joints")
-    fall: float = quantity("1", 200.0, ge=0, description="once, at a fall or where the simulation diverges")
+    tilt: float = quantity("1/rad", 100.0, ge=0, le=1e6, description="per rad of pelvis error: 1 at 0.01 rad")
+    zmp: float = quantity("1/m", 1.0 / 0.03, ge=0, le=1e6, description="per m of ZMP deviation: 1 at 0.03 m")
+    effort: float = quantity("1/(N·m)", 0.001, ge=0, le=1e6, description="per N·m of servo torque, rms over the joints")
+    smoothness: float = quantity("s/rad", 0.1, ge=0, le=1e6, description="per rad/s of the offsets, rms over joints")
+    fall: float = quantity("1", 200.0, ge=0, le=1e6, description="once, at a fall or where the simulation diverges")
     standing: float = quantity(
-        "1", 1.0, ge=0, description="factor of tilt and zmp before and after the walk, where the metrics count nothing"
+        "1", 1.0, ge=0, le=1e6, description="factor of tilt and zmp before and after the walk, which is not scored"
     )
 
 

@@ -1,0 +1,64 @@
+"""How this project is installed: from a checkout or as a package, and what of it is where."""
+
+import re
+from importlib.metadata import PackageNotFoundError, PackagePath, files, requires
+from pathlib import Path
+
+_DISTRIBUTION = "elastic-env"
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+def checkout() -> Path | None:
+    """Folder of the checkout that this code runs from; None for an installed package."""
+    return _ROOT if (_ROOT / "constraints.txt").is_file() and (_ROOT / "pyproject.toml").is_file() else None
+
+
+def install_command(extra: str) -> str:
+    """The command that installs an extra: of the checkout, or by the names of its packages.
+
+    Args:
+        extra: Such as train.
+    """
+    root = checkout()
+    if root is not None:
+        return f"pip install -c constraints.txt '.[{extra}]' in {root}"
+    return f"pip install {' '.join(_packages_of(extra))}"
+
+
+def _packages_of(extra: str) -> list[str]:
+    """Packages of an extra with their versions, as the installed package names them."""
+    try:
+        known = requires(_DISTRIBUTION) or []
+    except PackageNotFoundError:
+        known = []
+    parts = [requirement.partition(";") for requirement in known]
+    of_extra = re.compile(rf"""extra\s*==\s*['"]{re.escape(extra)}['"]""")
+    return [f"'{name.strip()}'" for name, _, marker in parts if of_extra.search(marker)]
+
+
+def configurations_are(file: Path) -> str:
+    """Where the configurations are, for an error about one that does not exist; empty where none of them is meant.
+
+    Args:
+        file: The one that was named.
+    """
+    root = checkout()
+    own = None if root is None else root / "configs" / file.name
+    if own is not None and own.is_file():
+        return f"; that of elastic-env is {own}"
+    if file.parent.name != "configs":
+        return ""
+    if own is not None:
+        return f"; those of elastic-env are in {own.parent}"
+    shipped = [str(found.locate()) for found in _files() if found.suffix == ".yaml"]
+    return (
+        "; the folder configs is in the source of elastic-env and not in the installed package: copy it from there. "
+        f"With the package come {', '.join(shipped) or 'none'}"
+    )
+
+
+def _files() -> list[PackagePath]:
+    try:
+        return list(files(_DISTRIBUTION) or [])
+    except PackageNotFoundError:
+        return []

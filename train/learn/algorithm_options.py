@@ -1,0 +1,182 @@
+"""Options of the learning algorithms: which there are, their bounds and meanings.
+
+A number beyond its bound would become nan, or fill the memory, in the midst of a training; it is refused before one.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.core.errors import shown
+
+CONSTANTS = "CMA-ES"
+"""Algorithm that searches constants instead of training a network."""
+
+_OURS = {
+    "policy": "the network is an MlpPolicy; policy_kwargs has its parameters",
+    "env": "the configuration's env and scenarios name the worlds",
+    "device": "training runs on the CPU, so that a resumed run ends with the same weights",
+    "seed": "the configuration's seeds are the training seeds",
+    "verbose": "elastic train shows the progress",
+    "tensorboard_log": "TensorBoard's files go to the folder of the training seed",
+    "_init_setup_model": "the model is built whole",
+}
+"""Arguments of the algorithms that are no options, and what stands in their place."""
+
+_LARGEST_WEIGHT = 1e3
+_WIDEST, _MOST_LAYERS = 4096, 16
+
+
+def _network(*parts: str) -> Any:
+    """Annotation of the widths of hidden layers: of all networks, or a mapping by their names."""
+
+    def require(given: Any) -> Any:
+        named = given if isinstance(given, dict) else dict.fromkeys(parts, given)
+        if named.keys() != set(parts) or not all(_are_widths(widths) for widths in named.values()):
+            raise ValueError(
+                f"must be a list of at most {_MOST_LAYERS} widths, whole numbers >= 1 and <= {_WIDEST}, or a mapping "
+                f"of such lists by {' and '.join(parts)}, got {shown(given)}"
+            )
+        return given
+
+    return Annotated[Any, AfterValidator(require)]
+
+
+def _are_widths(given: Any) -> bool:
+    is_list = isinstance(given, list) and len(given) <= _MOST_LAYERS
+    return is_list and all(type(width) is int and 1 <= width <= _WIDEST for width in given)
+
+
+def _entropy_weight(given: Any) -> Any:
+    """The weight of SAC's entropy, as a number or as what stands for one that is learned."""
+    if isinstance(given, str):
+        prefix, _, first = given.partition("_")
+        is_right = prefix == "auto" and re.fullmatch(r"|[0-9]{1,3}(\.[0-9]{1,9})?", first) is not None
+    else:
+        is_right = type(given) in (int, float) and 0 <= given <= _LARGEST_WEIGHT
+    if not is_right:
+        raise ValueError(
+            f"must be the weight of the entropy, >= 0 and <= {_LARGEST_WEIGHT:g}, or auto to learn it, "
+            f"or such as auto_0.1 to begin with it, got {shown(given)}"
+        )
+    return given
+
+
+class _Options(Model):
+    """Options that every algorithm has."""
+
+    learning_rate: float = quantity("1", 5e-4, gt=0, le=1, description="step of the optimiser")
+    gamma: float = quantity("1", 0.95, ge=0, le=1, description="discount of the reward per decision")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _none_is_set_by_us(cls, values: Any) -> Any:
+        given = [name for name in _OURS if name in values]
+        if given:
+            raise ValueError("; ".join(f"leave out {name!r}: {_OURS[name]}" for name in given))
+        return values
+
+
+class _NetworkOptions(Model):
+    """Parameters of a network, `policy_kwargs`."""
+
+    activation_fn: Literal["Tanh", "ReLU"] = "Tanh"
+    log_std_init: float = quantity(
+        "1", -1.0, ge=-20, le=2, description="logarithm of the first standard deviation of the residual, which is in ±1"
+    )
+    use_expln: bool = False
+    share_features_extractor: bool = False
+    optimizer_kwargs: dict[str, Any] = {}
+
+
+class _ActorCriticNetwork(_NetworkOptions):
+    """Parameters of the network of PPO and A2C."""
+
+    net_arch: _network("pi", "vf") = [64, 64]  # pyright: ignore[reportInvalidTypeForm]
+    """Widths of the hidden layers of both networks, or of actor (pi) and value (vf)."""
+    ortho_init: bool = True
+    full_std: bool = True
+    squash_output: bool = False
+
+
+class _SACNetwork(_NetworkOptions):
+    """Parameters of the networks of SAC."""
+
+    net_arch: _network("pi", "qf") = {"pi": [64, 64], "qf": [256, 256]}  # pyright: ignore[reportInvalidTypeForm]
+    """Widths of the hidden layers of both networks, or of actor (pi) and critics (qf)."""
+    clip_mean: float = quantity("1", 2.0, ge=0, le=100, description="bound of the mean before tanh")
+    n_critics: int = quantity("1", 2, ge=1, le=16, description="critics")
+
+
+class _StableBaselines(_Options):
+    """Options of the classes of stable_baselines3."""
+
+    use_sde: bool = False
+    sde_sample_freq: int = quantity("1", -1, ge=-1, le=10**6, description="decisions between draws of the noise")
+    stats_window_size: int = quantity("1", 100, ge=1, le=10**6, description="episodes in a mean of TensorBoard's")
+
+
+class _OnPolicy(_StableBaselines):
+    """Options of PPO and A2C."""
+
+    n_steps: int = quantity("1", 32, ge=1, le=100_000, description="decisions of every world between updates")
+    gae_lambda: float = quantity("1", 0.95, ge=0, le=1, description="weight of later advantages")
+    ent_coef: float = quantity("1", 0.0, ge=0, le=_LARGEST_WEIGHT, description="weight of the entropy in the loss")
+    vf_coef: float = quantity("1", 0.5, ge=0, le=_LARGEST_WEIGHT, description="weight of the value in the loss")
+    max_grad_norm: float = quantity("1", 0.5, gt=0, le=1e6, description="bound of the gradient's norm")
+    normalize_advantage: bool = True
+    policy_kwargs: _ActorCriticNetwork | None = None
+
+
+class _PPO(_OnPolicy):
+    batch_size: int = quantity("1", 512, ge=2, le=10**7, description="decisions in a minibatch")
+    n_epochs: int = quantity("1", 10, ge=1, le=1000, description="passes over the decisions in an update")
+    clip_range: float = quantity("1", 0.2, gt=0, le=10, description="bound of the policy's ratio, about 1")
+    clip_range_vf: float | None = quantity("1", None, gt=0, le=1e6, description="bound of a value's change")
+    target_kl: float | None = quantity("1", None, gt=0, le=1e3, description="divergence that ends an update")
+
+
+class _A2C(_OnPolicy):
+    rms_prop_eps: float = quantity("1", 1e-5, gt=0, le=1, description="smallest divisor of the optimiser")
+    use_rms_prop: bool = True
+
+
+class _SAC(_StableBaselines):
+    ent_coef: Annotated[Any, AfterValidator(_entropy_weight)] = "auto"
+    """Weight of the entropy, at most 1000; auto to learn it, auto_0.1 to begin at 0.1."""
+    batch_size: int = quantity("1", 512, ge=1, le=10**7, description="decisions in a minibatch")
+    buffer_size: int = quantity("1", 200_000, ge=1, le=10**7, description="decisions that are kept")
+    learning_starts: int = quantity("1", 2_000, ge=0, le=10**9, description="decisions before the first update")
+    train_freq: int = quantity("1", 4, ge=1, le=10**6, description="decisions of every world between updates")
+    gradient_steps: int = quantity("1", 8, ge=-1, le=10**6, description="steps of an update, -1: as decisions")
+    tau: float = quantity("1", 0.005, ge=0, le=1, description="share of the critic that its target takes on")
+    target_update_interval: int = quantity("1", 1, ge=1, le=10**6, description="steps between changes of the target")
+    target_entropy: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = "auto"
+    """Entropy at which a learned weight aims."""
+    n_steps: int = quantity("1", 1, ge=1, le=1000, description="decisions of a return")
+    use_sde_at_warmup: bool = False
+    policy_kwargs: _SACNetwork | None = None
+
+
+class _CMAES(Model):
+    population_size: int = quantity("1", 16, ge=2, le=100_000, description="candidates of a generation")
+    sigma: float = quantity("1", 0.3, gt=0, le=2, description="first standard deviation of the residual in ±1")
+
+
+class _OnesOwn(_Options, extra="allow"):
+    """Options of a class of one's own, which itself checks those that are not among these."""
+
+
+_MODELS: dict[str, type[Model]] = {"A2C": _A2C, "PPO": _PPO, "SAC": _SAC, CONSTANTS: _CMAES}
+
+
+def checked_options(algorithm: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of an algorithm, within their bounds; those that are left out stay so.
+
+    Raises:
+        ModelError: One does not exist, is set by the training itself, or is beyond its bound.
+    """
+    return _MODELS.get(algorithm, _OnesOwn)(**options).model_dump(exclude_unset=True)

@@ -1,0 +1,40 @@
+"""Warnings of long work: each text once, whatever the number of environments and processes that give it."""
+
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+_SAID: ContextVar[set[str] | None] = ContextVar("said", default=None)
+
+
+def said_so_far() -> frozenset[str]:
+    """Texts that were shown within `each_once`; processes are told them, so that they do not show them again."""
+    return frozenset(_SAID.get() or ())
+
+
+@contextmanager
+def each_once(said: Iterable[str] = ()) -> Iterator[None]:
+    """Show each warning within once.
+
+    Args:
+        said: Texts that were shown before, such as in the process that started this one.
+    """
+    outer = _SAID.get()
+    known = {*said} if outer is None else outer
+    known.update(said)
+    token = _SAID.set(known)
+    before = warnings.showwarning
+
+    def show(message: Warning | str, *where: Any) -> None:
+        if str(message) not in known:
+            known.add(str(message))
+            before(message, *where)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
+        _SAID.reset(token)
