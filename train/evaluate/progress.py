@@ -32,7 +32,7 @@ class Curves:
     ratios: dict[str, Array]
 
 
-def read_progress(folder: Path, metrics: Sequence[str], further: Sequence[str] = ()) -> list[dict[str, Any]]:
+def read_progress(folder: Path, metrics: Sequence[str] = (), further: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Evaluations on the way of a training seed, as its `progress.csv` has them.
 
     Args:
@@ -61,11 +61,12 @@ def read_progress(folder: Path, metrics: Sequence[str], further: Sequence[str] =
 
 def _evaluation(row: Mapping[str, str], columns: Sequence[str]) -> dict[str, Any]:
     """Numbers of a row, and its scenario."""
-    found: dict[str, Any] = {name: float(row[name]) for name in columns}
-    for name, value in found.items():
-        if name.startswith("base_") and value == 0.0:
+    found: dict[str, Any] = {"scenario": row["scenario"]}
+    found |= {name: float(value) for name, value in row.items() if name != "scenario"}
+    for name in columns:
+        if found[name] == 0.0 and name.startswith("base_"):
             raise ValueError(f"{name} is zero")
-    return {**found, "scenario": row["scenario"]}
+    return found
 
 
 def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves | None:
