@@ -32,42 +32,41 @@ class Curves:
     ratios: dict[str, Array]
 
 
-def read_progress(folder: Path, metrics: Sequence[str]) -> list[dict[str, Any]]:
+def read_progress(folder: Path, metrics: Sequence[str] = (), further: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Evaluations on the way of a training seed, as its `progress.csv` has them.
 
     Args:
         folder: Of the training seed.
         metrics: Scores that are needed, of the policy and of its base.
+        further: Other columns that are needed.
 
     Raises:
         ConfigurationError: The file is missing, is no such table, or lacks a score.
     """
     path = folder / PROGRESS
+    columns = ["decisions", *metrics, *(f"base_{metric}" for metric in metrics), *further]
     try:
         text = read_bounded(path, MOST_BYTES).decode("utf-8")
-        rows = [_evaluation(row, metrics) for row in csv.DictReader(text.splitlines())]
+        rows = [_evaluation(row, columns) for row in csv.DictReader(text.splitlines())]
     except ConfigurationError:
         raise
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise ConfigurationError(
-            f"{path} must be the table of a training, with {', '.join(_columns(metrics))}: {error}"
+            f"{path} must be the table of a training, with {', '.join(columns)}: {error}"
         ) from None
     if not rows:
         raise ConfigurationError(f"{path} has no evaluations")
     return rows
 
 
-def _columns(metrics: Sequence[str]) -> list[str]:
-    return ["decisions", *metrics, *(f"base_{metric}" for metric in metrics), "failed"]
-
-
-def _evaluation(row: Mapping[str, str], metrics: Sequence[str]) -> dict[str, Any]:
+def _evaluation(row: Mapping[str, str], columns: Sequence[str]) -> dict[str, Any]:
     """Numbers of a row, and its scenario."""
-    found: dict[str, Any] = {name: float(row[name]) for name in _columns(metrics)}
-    for metric in metrics:
-        if found[f"base_{metric}"] == 0.0:
-            raise ValueError(f"base_{metric} is zero")
-    return {**found, "scenario": row["scenario"]}
+    found: dict[str, Any] = {"scenario": row["scenario"]}
+    found |= {name: float(value) for name, value in row.items() if name != "scenario"}
+    for name in columns:
+        if found[name] == 0.0 and name.startswith("base_"):
+            raise ValueError(f"{name} is zero")
+    return found
 
 
 def learning_curves(folders: Sequence[str], columns: Sequence[Column]) -> Curves | None:

@@ -207,7 +207,7 @@ def _table(config: TrainConfig, folder: Path) -> Table:
     for name in ("seed", "scenario", *(column.label for column in columns), "failed"):
         table.add_column(name, justify="left" if name == "scenario" else "right")
     for seed in config.seeds:
-        rows = read_progress(folder / f"seed_{seed}", [column.metric for column in columns])
+        rows = read_progress(folder / f"seed_{seed}", [column.metric for column in columns], ["failed"])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
             scores = [_change(row[f"base_{column.metric}"], row[column.metric], column.scale) for column in columns]
             table.add_row(str(seed), row["scenario"], *scores, f"{row['failed']:.0f}")
