@@ -20,7 +20,7 @@ from baselines.policies import make
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
 from baselines.residual.settings import Bound, ResidualSettings
-from elastic_env.core.errors import ActionError, ConfigurationError
+from elastic_env.core.errors import ActionError, ConfigurationError, shown
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.state import Stateful
 from elastic_env.runtime.envs import final_of, reset_mask
@@ -67,7 +67,7 @@ class _Deciding(Stateful):
         """A residual for the observations of its decision as numbers within [−1, 1], out of the mirror."""
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
-            raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {residual!r}")
+            raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {shown(residual)}")
         clipped = np.clip(given, -1.0, 1.0)
         return self.features.turned_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
 

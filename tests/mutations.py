@@ -40,6 +40,8 @@ NASTY: list[Any] = [
     [[]], [None], [0], [-1.5, 2], ["x"], [1, 2, 3], [0.5, 0.5, 0.5], {"x": 1}, {"kind": "sine"},
     {"kind": "hold", "positions": 900},
     {"kind": "steps", "moves": 1000}, {"step_period": 3, "num_steps": 10**6}, {"name": "x"}, {"": 0}, [[1, 2], [3]],
+    1e200, -1e9, "a b " * 2500, "'x" * 5000, ["x" * 10_000], {"x" * 10_000: 1}, {"device": "cuda"},
+    {"log_std_init": 1e9},
     [1] * 2000, {str(i): i for i in range(2000)}, "a\nb", "\u202e",
 ]  # fmt: skip
 ADDED = [
@@ -50,7 +52,8 @@ KEYS = [
     "name", "env", "references", "reference", "scenarios", "policies", "options", "env_options", "joint", "stiffness",
     "timestep_s", "gait", "robot", "reward", "algorithm", "algorithm_options", "policy_kwargs", "n_steps", "net_arch",
     "worlds", "sweep", "values", "option", "groups", "seeds", "label", "level", "num_envs", "settings", "scale",
-    "history", "observe", "joints", "decision_period", "bank", "num_steps", "damping", "servo", "gains", "x", "<<", "",
+    "learning_rate", "log_std_init", "device", "seed", "policy", "weights", "base", "ranges", "figures", "metric",
+    "map", "history", "observe", "joints", "decision_period", "bank", "num_steps", "damping", "servo", "gains", "x", "<<", "",
 ]  # fmt: skip
 
 

@@ -114,8 +114,6 @@ class _SACNetwork(_NetworkOptions):
 class _StableBaselines(_Options):
     """Options of the classes of stable_baselines3."""
 
-    use_sde: bool = False
-    sde_sample_freq: int = quantity("1", -1, ge=-1, le=10**6, description="decisions between draws of the noise")
     stats_window_size: int = quantity("1", 100, ge=1, le=10**6, description="episodes in a mean of TensorBoard's")
 
 
@@ -128,6 +126,8 @@ class _OnPolicy(_StableBaselines):
     vf_coef: float = quantity("1", 0.5, ge=0, le=_LARGEST_WEIGHT, description="weight of the value in the loss")
     max_grad_norm: float = quantity("1", 0.5, gt=0, le=1e6, description="bound of the gradient's norm")
     normalize_advantage: bool = True
+    use_sde: bool = False
+    sde_sample_freq: int = quantity("1", -1, ge=-1, le=10**6, description="decisions between draws of the noise")
     policy_kwargs: _ActorCriticNetwork | None = None
 
 
@@ -140,7 +140,7 @@ class _PPO(_OnPolicy):
 
 
 class _A2C(_OnPolicy):
-    rms_prop_eps: float = quantity("1", 1e-5, gt=0, le=1, description="smallest divisor of the optimiser")
+    rms_prop_eps: float = quantity("1", 1e-5, ge=1e-12, le=1, description="smallest divisor of the optimiser")
     use_rms_prop: bool = True
 
 
@@ -151,13 +151,12 @@ class _SAC(_StableBaselines):
     buffer_size: int = quantity("1", 200_000, ge=1, le=10**7, description="decisions that are kept")
     learning_starts: int = quantity("1", 2_000, ge=0, le=10**9, description="decisions before the first update")
     train_freq: int = quantity("1", 4, ge=1, le=10**6, description="decisions of every world between updates")
-    gradient_steps: int = quantity("1", 8, ge=-1, le=10**6, description="steps of an update, -1: as decisions")
+    gradient_steps: int = quantity("1", 8, ge=-1, le=10_000, description="steps of an update, -1: as decisions")
     tau: float = quantity("1", 0.005, ge=0, le=1, description="share of the critic that its target takes on")
     target_update_interval: int = quantity("1", 1, ge=1, le=10**6, description="steps between changes of the target")
     target_entropy: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = "auto"
     """Entropy at which a learned weight aims."""
     n_steps: int = quantity("1", 1, ge=1, le=1000, description="decisions of a return")
-    use_sde_at_warmup: bool = False
     policy_kwargs: _SACNetwork | None = None
 
 
