@@ -571,7 +571,7 @@ def test_help_teaches(arguments: list[str], words: list[str], capsys: pytest.Cap
     assert [word for word in words if word not in printed] == []
 
 
-COMMANDS = (
+NAMES = (
     "identify",
     "evaluate",
     "compare",
@@ -588,7 +588,7 @@ COMMANDS = (
 OF_HARDWARE = ("scan", "check", "run", "emulate")
 
 
-@pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("hardware", name) for name in OF_HARDWARE)])
+@pytest.mark.parametrize("command", [*((name,) for name in NAMES), *(("hardware", name) for name in OF_HARDWARE)])
 def test_every_command_has_help_and_refuses_what_it_does_not_know(
     command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,8 +6,11 @@ The pendulum hangs at q = 0 and swings in the vertical plane, q positive towards
 from the axis, with a radius of gyration of 0.1 m, is our choice.
 """
 
+from typing import Self
+
 import mujoco
 import numpy as np
+from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
@@ -16,16 +19,24 @@ from elastic_env.joint.make_elastic import Form, transformed
 
 JOINT = "joint"
 GRAVITY_M_S2 = 9.81
+_LEAST = 1e-3
+"""Of the parameters of a pendulum, in their units: with less its inertia is lost in rounding."""
+_MOST = {"gravity_torque": ("N·m", 1e4), "mass": ("kg", 1e4), "gyration_radius": ("m", 10.0)}
 
 
 class Pendulum(Model):
     """The load of the testbed."""
 
-    gravity_torque: float = quantity("N·m", 60.0, ge=1e-3, le=1e4, description="torque that holds it at the horizontal")
-    mass: float = quantity("kg", 10.0, ge=1e-3, le=1e4, description="mass of bob and linkage")
-    gyration_radius: float = quantity(
-        "m", 0.1, ge=1e-3, le=10, description="radius of gyration about its center of mass"
-    )
+    gravity_torque: float = quantity("N·m", 60.0, gt=0, description="torque that holds it at the horizontal")
+    mass: float = quantity("kg", 10.0, gt=0, description="mass of bob and linkage")
+    gyration_radius: float = quantity("m", 0.1, gt=0, description="radius of gyration about its center of mass")
+
+    @model_validator(mode="after")
+    def _can_be_built(self) -> Self:
+        for name, (unit, most) in _MOST.items():
+            if not _LEAST <= (value := getattr(self, name)) <= most:
+                raise ValueError(f"{name} must be from {_LEAST:g} to {most:g} [{unit}], got {value:g}")
+        return self
 
     @property
     def com_distance(self) -> float:
