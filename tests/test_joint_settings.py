@@ -120,6 +120,8 @@ def test_what_a_file_leaves_out_is_rigid_and_said(tmp_path: Path) -> None:
     assert list(configure_robot(ARM, file).joints) == ["j2"]
     with pytest.raises(ConfigurationError, match="stiffness of joint 'j1' is missing; give 'j1' or a pattern"):
         compensator({"j2": 400.0})
+    with pytest.raises(ConfigurationError, match="stiffness of joint 'j1' is missing"):
+        compensator(written(tmp_path, "gr: held\n"))
 
 
 @pytest.mark.parametrize("rigid", ["rigid", ".inf", "{stiffness: rigid}", "{stiffness: .inf}"])
