@@ -120,6 +120,8 @@ def test_what_a_file_leaves_out_is_rigid_and_said(tmp_path: Path) -> None:
     assert list(configure_robot(ARM, file).joints) == ["j2"]
     with pytest.raises(ConfigurationError, match="stiffness of joint 'j1' is missing; give 'j1' or a pattern"):
         compensator({"j2": 400.0})
+    with pytest.raises(ConfigurationError, match="stiffness of joint 'j1' is missing"):
+        compensator(written(tmp_path, "gr: held\n"))
 
 
 @pytest.mark.parametrize("rigid", ["rigid", ".inf", "{stiffness: rigid}", "{stiffness: .inf}"])
@@ -237,7 +239,7 @@ def test_the_velocity_gain_is_what_damps_the_servo(actuators: str, gain: float, 
 def test_a_servo_that_nothing_damps_is_damped_and_said() -> None:
     """Catches a swing that never ends, and an assumption without its value. Critical damping in closed form."""
     model = KV0.replace(' damping="5"', "")
-    with pytest.warns(UserWarning, match="velocity_gain of j1 .* N·m·s/rad, critical damping of rotor and links"):
+    with pytest.warns(UserWarning, match="velocity_gain of j1 .* N·m·s/rad, critical damping"):
         joint = configure_robot(model, {"j*": 400}).joints["j1"]
     data = mujoco.MjData(compiled := mujoco.MjModel.from_xml_string(model))
     mujoco.mj_forward(compiled, data)

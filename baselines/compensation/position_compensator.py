@@ -418,14 +418,16 @@ def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> N
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
     """What a file says of joints, in which the hinges that it leaves out are rigid."""
     mapping = read_mapping(file)
-    rigid = [name for name in _hinges(model) if key_of(mapping, name) is None]
-    said = [name for name in rigid if commanded is None or name in commanded]
-    if said and len(said) < len(_hinges(model)):
-        warnings.warn(
-            f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}: {HELD} or its "
-            "stiffness K [N·m/rad] there",
-            stacklevel=4,
-        )
+    names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    left_out = [name for name in names if name and key_of(mapping, name) is None]
+    said = [name for name in left_out if commanded is None or name in commanded]
+    if not said or len(left_out) == len(names):
+        return mapping
+    warnings.warn(
+        f"{file} leaves out {', '.join(said)}, taken for rigid; say {said[0]}: {RIGID}, {said[0]}: {HELD} or its "
+        "stiffness K [N·m/rad] there",
+        stacklevel=4,
+    )
     return mapping | dict.fromkeys(said, RIGID)
 
 

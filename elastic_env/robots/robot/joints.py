@@ -24,6 +24,8 @@ _SERVO_TO_SPRING = 50.0
 """k_p of a servo that nobody knows over K: stiff enough to add little to the deflection while its integrator acts."""
 _LEAST_SERVO_TO_SPRING, _SERVO_RAD_S = 5.0, 1000.0
 """The same where the rotor is as light as its links: by the frequency of the rotor on its servo, at least 5 K."""
+_FAR_STIFFER = 10.0
+"""k_p over K from which on a servo moves its rotor alone, and the spring keeps the links from it."""
 _FASTEST_PER_S = 2500.0
 """Rate of assumed dampers, which a physics step of 0.5 ms follows [1/s]."""
 _SPEED_LIMIT_RAD_S = 2.0 * np.pi
@@ -221,14 +223,13 @@ class _Assumed:
         links = self._links
         kp = _first(known.position_gain, ratio * self._own.stiffness)
         kv = known.velocity_gain
-        if kv is None and known.position_gain is None:
-            kv = 2.0 * np.sqrt(kp * rotor)
-        elif kv is None:  # softer than the spring, it carries the links as well
-            kv = 2.0 * float(np.sqrt(kp * (rotor + links.most)))
-            if not is_given:
+        if kv is None:
+            carries_links = known.position_gain is not None and kp < _FAR_STIFFER * self._own.stiffness
+            kv = 2.0 * float(np.sqrt(kp * (rotor + links.most * carries_links)))
+            if known.position_gain is not None and not is_given:
                 self.said.append(
-                    f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping of rotor and links, as "
-                    "nothing in the model damps its servo"
+                    f"velocity_gain of {self._name} {kv:.3g} N·m·s/rad, critical damping, as nothing in the model "
+                    "damps its servo"
                 )
         enough = _TORQUE_RESERVE * links.torque + _RESERVE_RAD_S2 * (rotor + links.most)
         limit = known.torque_limit
