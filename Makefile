@@ -37,6 +37,7 @@ test: $(STAMP) ## Run the tests, without network or display
 lint: $(STAMP) ## Check style, format and types; changes nothing
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache >/dev/null || $(BIN)/lint-imports --no-cache
 	$(BIN)/pyright
 
 format: $(STAMP) ## Format the code and repair what ruff can repair

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio
 import pytest
 
+from docs.pages.gallery import AtRest, measure
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.tree.torque import TreeTorque
@@ -27,7 +28,6 @@ from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.robots import gallery
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot, hinge_names, home_pose
 from tests.gallery_files import FOLDER, PACKAGED, excerpt
-from train.experiments.gallery import AtRest, measure
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from baselines.catalogue import Track
+from docs.pages.learned import learned_maps
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.runtime.scenario import make_scenario
@@ -24,7 +25,6 @@ from train.figures.figures import draw_maps
 from train.figures.map_plots import Square, blended, panels
 from train.report import Results, write_report
 from train.report.changes_tables import write_maps
-from train.report.pages.learned import learned_maps
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from docs.pages.cells import KEPT, Cells, Kept, condensed, keep, read_rows, scaled
+from docs.pages.learned import MAPS, learned_maps
+from docs.pages.write import PARTS, PICTURES, TABLES, Results, figure, marks, page_with, pages, reads
+from docs.pages.write import main as write_pages
 from elastic_env.core.errors import ConfigurationError
 from train.report.leaderboard import leaderboard_markdown, read_leaderboard
-from train.report.pages.cells import KEPT, Cells, Kept, condensed, keep, read_rows, scaled
-from train.report.pages.learned import MAPS, learned_maps
-from train.report.pages.write import PARTS, PICTURES, TABLES, Results, figure, marks, page_with, pages, reads
-from train.report.pages.write import main as write_pages
 from train.runs.escaping import write_records
 
 ROOT = Path(__file__).parents[1]
@@ -134,7 +134,7 @@ def test_a_page_is_written_between_its_marks_and_nowhere_else(checkout: Path) ->
         with pytest.raises(ConfigurationError, match="needs the lines"):
             page_with(text, results)
     Path("docs", "results", "gallery.csv").unlink()
-    with pytest.raises(ConfigurationError, match=r"gallery.csv is missing; python -m train.experiments.gallery"):
+    with pytest.raises(ConfigurationError, match=r"gallery.csv is missing; python -m docs.pages.gallery"):
         write_pages([])
     Path("docs", "results", "demo_episodes.csv").unlink()
     with pytest.raises(ConfigurationError, match=r"demo_episodes.csv is missing; copy it from runs/demo"):

@@ -40,7 +40,6 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import Evaluation, evaluate
 from train.experiments.compare import CompareConfig
 from train.experiments.play import play
-from train.report.pages.cells import read_rows
 from train.runs.folders import new_run, run_folder
 from train.runs.progress import show_progress
 from train.runs.warned import each_once, said_so_far
@@ -660,7 +659,7 @@ def test_speed_measures_and_writes_every_contender(capsys: pytest.CaptureFixture
     for result in results:
         assert min(result["steps_per_s"], result["ratio"]) > 0.0
         assert result["contender"] != "raw mj_step" or result["ratio"] == 1.0
-    kept = read_rows(Path("runs/speed/speed.csv"))
+    kept = rows_of(Path("runs/speed/speed.csv"))
     assert [row["contender"] for row in kept] == [result["contender"] for result in results]
     assert "predict" in Path("runs/speed/profile.txt").read_text()
     assert "runs/speed/speed.json" in capsys.readouterr().out

@@ -1,6 +1,6 @@
 """Small tables of comparisons, kept under docs/results: a row per cell and statistic, and the metrics that pages show.
 
-python -m train.report.pages.keep RUN ...    # docs/results/NAME.csv from the episodes of each run
+python -m docs.pages.keep RUN ...    # docs/results/NAME.csv from the episodes of each run
 """
 
 import csv

@@ -1,6 +1,6 @@
 """Pages of the documentation whose figures come from the results beside them, and from nowhere else.
 
-    python -m train.report.pages          # README.md and docs/*.md from docs/results
+    python -m docs.pages          # README.md and docs/*.md from docs/results
 
 A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. A figure
 within a sentence stands between `<!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->` and `<!-- / -->`.
@@ -13,13 +13,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from elastic_env.core.errors import ConfigurationError
-from train.evaluate.leaderboard import Standing
-from train.figures.step_picture import step_svg
-from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
-from train.report.pages import arms, joints, speeds, walks
-from train.report.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
-from train.report.pages.learned import (
+from docs.pages import arms, joints, speeds, walks
+from docs.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
+from docs.pages.learned import (
     ARM,
     GROUPS,
     MAPS,
@@ -30,10 +26,12 @@ from train.report.pages.learned import (
     learning_in_short,
     maps_markdown,
 )
+from docs.pages.step_picture import step_svg
+from elastic_env.core.errors import ConfigurationError
+from train.evaluate.leaderboard import Standing
+from train.experiments.demo import PAPER_PELVIS
+from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
 from train.runs.escaping import markdown_table
-
-PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
-"""Angle error of the pelvis that the paper reports in both gaits [mrad], its Figs. 7 and 8."""
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
 _SAGS = ("uncompensated_rms", "uncompensated_peak", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
@@ -42,7 +40,7 @@ _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 TABLES = {
     "demo_episodes": "copy it from runs/demo/episodes.csv after `elastic demo`",
-    "gallery": "python -m train.experiments.gallery writes it",
+    "gallery": "python -m docs.pages.gallery writes it",
     **{
         name: f"copy it from statistics.csv after `elastic compare configs/{name}.yaml`"
         for name in (
@@ -61,7 +59,7 @@ TABLES = {
     "link_encoder": "copy it from episodes.csv after `elastic compare configs/robot.yaml`",
     "drawn_robots": "copy it from robots.csv after `elastic compare configs/drawn_robots.yaml`",
     **{
-        kept.table or name: f"python -m train.report.pages.keep writes it from a run of configs/{name}.yaml"
+        kept.table or name: f"python -m docs.pages.keep writes it from a run of configs/{name}.yaml"
         for name, kept in KEPT.items()
     },
     **{
@@ -70,10 +68,10 @@ TABLES = {
     },
     "cluster": "python -m tests.cluster_trials measures it",
     "arm_identification": "python -m tests.identification_trials measures it",
-    "step": "python -m train.experiments.pages.step writes it",
+    "step": "python -m docs.pages.step writes it",
     **dict.fromkeys(
         ("identification", "output_compensator", "gravity_torque"),
-        "python -m train.experiments.pages.statics writes it",
+        "python -m docs.pages.statics writes it",
     ),
 }
 """Tables of the results, and where they come from."""
@@ -276,7 +274,7 @@ def pages(root: Path) -> list[Path]:
 def main(arguments: Sequence[str]) -> None:
     """Write the parts of all pages of a checkout: [FOLDER], by default the working directory."""
     if len(arguments) > 1:
-        raise SystemExit("usage: python -m train.report.pages [CHECKOUT]")
+        raise SystemExit("usage: python -m docs.pages [CHECKOUT]")
     root = Path(*arguments)
     found, results = pages(root), Results.read(root / "docs" / "results")
     for page in found:

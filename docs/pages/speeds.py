@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
+from docs.pages.cells import Rows
 from train.evaluate.evaluate import grouped
 from train.evaluate.leaderboard import Standing
-from train.report.pages.cells import Rows
 from train.runs.escaping import markdown_table
 
 _RAW, _OURS = "raw mj_step", "vector env"

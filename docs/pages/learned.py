@@ -5,11 +5,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from docs.pages.cells import Rows
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import BEST_ANALYTIC, FEWEST_SEEDS, percent, percent_interval, signed_off
 from train.evaluate.evaluate import grouped
 from train.evaluate.statistics import Estimate
-from train.report.pages.cells import Rows
 from train.runs.escaping import markdown_table
 
 _METRICS = {

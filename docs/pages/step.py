@@ -1,6 +1,6 @@
 """Pelvis error and ZMP deviation over a step of the walk at 3 s, without and with compensation.
 
-`python -m train.experiments.pages.step [CHECKOUT]` writes docs/results/step.csv, and `python -m train.report.pages`
+`python -m docs.pages.step [CHECKOUT]` writes docs/results/step.csv, and `python -m docs.pages`
 draws it.
 """
 
@@ -12,10 +12,10 @@ from typing import Any
 import gymnasium
 from rich.console import Console
 
+from docs.pages.step_picture import CHARTS, WITH, WITHOUT
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import make_policy
 from train.experiments.play import episode
-from train.figures.step_picture import CHARTS, WITH, WITHOUT
 from train.runs.escaping import write_records
 
 BEGIN_S, END_S, EVERY = 4.0, 7.0, 5

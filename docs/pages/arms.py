@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import bootstrap
 
+from docs.pages.cells import Rows, minus
 from elastic_env.core.signals import Array
 from train.evaluate.evaluate import grouped
-from train.report.pages.cells import Rows, minus
 from train.runs.escaping import markdown_table
 
 _FIRST = "panda"

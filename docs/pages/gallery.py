@@ -1,6 +1,6 @@
 """The gallery of robots: how far they sag, with and without input compensation, and how that looks.
 
-    python -m train.experiments.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
+    python -m docs.pages.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
 
 Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of the robot.
 """

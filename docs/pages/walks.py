@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+from docs.pages.cells import Cells, Rows, failed, minus, scaled, shown
 from train.evaluate.leaderboard import Standing
-from train.report.pages.cells import Cells, Rows, failed, minus, scaled, shown
 from train.runs.escaping import markdown_table
 
 PELVIS, ZMP = "pelvis_error_rms_rad", "zmp_deviation_rms_m"

@@ -1,8 +1,8 @@
-"""Tables of the testbed's page, from the kept cells of comparisons and from `train.experiments.pages.statics`."""
+"""Tables of the testbed's page, from the kept cells of comparisons and from `docs.pages.statics`."""
 
 from collections.abc import Mapping, Sequence
 
-from train.report.pages.cells import Cells, Rows, failed, minus, scaled
+from docs.pages.cells import Cells, Rows, failed, minus, scaled
 from train.runs.escaping import markdown_table
 
 ERROR = "link_error_rms_rad"

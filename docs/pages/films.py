@@ -1,6 +1,6 @@
 """Short films of the docs: the same motion without compensation on the left, and with compensation on the right.
 
-`python -m train.experiments.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated WebP.
+`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated WebP.
 """
 
 import sys

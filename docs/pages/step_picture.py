@@ -1,6 +1,6 @@
 """Pelvis error and ZMP deviation over a step, without and with compensation, as an SVG for phones, light and dark.
 
-`python -m train.report.pages` draws it from docs/results/step.csv. `python -m train.experiments.pages.step` writes
+`python -m docs.pages` draws it from docs/results/step.csv. `python -m docs.pages.step` writes
 that table.
 """
 

@@ -1,0 +1,7 @@
+"""`python -m docs.pages [CHECKOUT]`."""
+
+import sys
+
+from docs.pages.write import main
+
+main(sys.argv[1:])

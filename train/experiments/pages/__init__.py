@@ -1,1 +1,0 @@
-"""Measurements and pictures of the documentation that no command makes."""

@@ -1,1 +1,0 @@
-"""Pages of the documentation, written from the results beside them: `python -m train.report.pages`."""

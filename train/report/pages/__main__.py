@@ -1,7 +1,0 @@
-"""`python -m train.report.pages [CHECKOUT]`."""
-
-import sys
-
-from train.report.pages.write import main
-
-main(sys.argv[1:])
