@@ -53,8 +53,8 @@ KEYS = [
     "timestep_s", "gait", "robot", "reward", "algorithm", "algorithm_options", "policy_kwargs", "n_steps", "net_arch",
     "worlds", "sweep", "values", "option", "groups", "seeds", "label", "level", "num_envs", "settings", "scale",
     "learning_rate", "log_std_init", "device", "seed", "policy", "weights", "base", "ranges", "figures", "metric",
-    "map", "history", "observe", "joints", "decision_period", "bank", "num_steps", "damping", "servo", "gains", "x",
-    "<<", "",
+    "map",
+    "history", "observe", "joints", "decision_period", "bank", "num_steps", "damping", "servo", "gains", "x", "<<", "",
 ]  # fmt: skip
 
 
