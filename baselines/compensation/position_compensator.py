@@ -24,7 +24,8 @@ from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.tree.torque import TreeTorque
-from elastic_env.joint.model_file import compiled_model
+from elastic_env.joint.known_torque import commanded_hinges, home_of, require_known_torque
+from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.motion.trajectory import minimum_jerk
 
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
@@ -75,16 +76,17 @@ class PositionCompensator:
         period_s: float = 0.01,
     ) -> None:
         self._model = model
-        self.joints = tuple(_hinges(model) if joints is None else joints)
+        named = stiffness if isinstance(stiffness, Mapping) else ()
+        self.joints = tuple(commanded_hinges(model, named) if joints is None else joints)
+        require_known_torque(model, self.joints)
         held = _held(model, self.joints)
-        _require_known_torque(model, held)
         self._links = TreeTorque(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
         limited = model.jnt_limited[at].astype(bool)
         self._lowest = np.where(limited, model.jnt_range[at, 0], -np.inf)
         self._highest = np.where(limited, model.jnt_range[at, 1], np.inf)
         for given in (stiffness, position_gain):
-            _require_patterns_that_fit(given, [*self.joints, *held])
+            _require_patterns_that_fit(given, [name for j in range(model.njnt) if (name := model.joint(j).name)])
         self._compliance = 1.0 / _per_joint("stiffness", stiffness, self.joints)
         self._of_command = self._compliance.copy()
         if position_gain is None:
@@ -97,10 +99,8 @@ class PositionCompensator:
         self.reset()
 
     @classmethod
-    def from_model(
-        cls, model: str | Path | mujoco.MjSpec | mujoco.MjModel, stiffness: PerJoint | str | Path, **options: Any
-    ) -> Self:
-        """From a file of MJCF or URDF, or from what MuJoCo made of one; further arguments as of the class.
+    def from_model(cls, model: GivenModel, stiffness: PerJoint | str | Path, **options: Any) -> Self:
+        """From a file of MJCF or URDF, its text, or what MuJoCo made of one; further arguments as of the class.
 
         `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`.
 
@@ -263,54 +263,10 @@ def _in_body(model: mujoco.MjModel, site: int, place: Array) -> Array:
     return model.site_pos[site] + turned
 
 
-def _hinges(model: mujoco.MjModel) -> list[str]:
-    names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    if not names:
-        raise ConfigurationError("the model has no hinge; a compensator needs a robot with rotary joints")
-    if not all(names):
-        raise ConfigurationError("a hinge of the model has no name; give each one, the stiffness is by name")
-    return names
-
-
-def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, float]:
-    """Positions of the joints that are not commanded [rad], [m]."""
-    known = [model.joint(j).name for j in range(model.njnt)]
-    require_known("joint", joints, known)
-    if len(set(joints)) != len(joints) or not joints:
-        raise ConfigurationError(f"joints must name at least one joint, and each once, got {shown(list(joints))}")
-    home = model.key_qpos[0] if model.nkey else model.qpos0
-    held = {}
-    for j, name in enumerate(known):
-        if int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
-            raise ConfigurationError(
-                f"joint {name!r} is free or a ball joint; a compensator needs a fixed base and hinges: the torque of a "
-                "floating robot depends on its contacts"
-            )
-        if name not in joints:
-            held[name] = float(home[model.jnt_qposadr[j]])
-    return held
-
-
-def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> None:
-    """Refuse what adds to the torque and is not in it: closed loops, springs of tendons, non-linear springs."""
-    for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
-        if (name := model.joint(int(j)).name) not in held:
-            raise ConfigurationError(
-                f"joint {name!r} has a spring whose torque is not linear, which is not compensated; give it one number"
-            )
-    for i in range(model.neq):
-        of_joints = model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT
-        names = (
-            [model.joint(int(j)).name for j in (model.eq_obj1id[i], model.eq_obj2id[i]) if j >= 0] if of_joints else []
-        )
-        if not of_joints or any(name not in held for name in names):
-            which = f"of {' and '.join(names)}" if names else "of bodies or tendons"
-            raise ConfigurationError(
-                f"the model has an equality constraint {which}, whose torque is not known in advance; take it out, or "
-                "leave its joints out of `joints`"
-            )
-    if model.tendon_stiffness.any() or model.tendon_stiffnesspoly.any():
-        raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
+def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
+    """Positions of the joints that are not commanded, by their number [rad], [m]."""
+    home = home_of(model)
+    return {j: float(home[model.jnt_qposadr[j]]) for j in range(model.njnt) if model.joint(j).name not in joints}
 
 
 def _warn_of_servos(model: mujoco.MjModel, joints: Sequence[str]) -> None:

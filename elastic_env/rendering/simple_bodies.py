@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
+from elastic_env.joint.model_file import compiled_spec
 
 _RADIUS = 0.02
 """Of a rod, over the size of the robot."""
@@ -19,7 +20,7 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
     Args:
         spec: It is changed. It has to compile.
     """
-    model = spec.copy().compile()
+    model = compiled_spec(spec.copy(), "the model")
     radius = _RADIUS * float(np.linalg.norm(model.body_pos, axis=1).sum())
     for body in [body for body in spec.bodies if not body.geoms]:
         ends = [model.body_pos[c] for c in np.flatnonzero(model.body_parentid == body.id) if c != body.id]
