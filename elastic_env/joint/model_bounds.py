@@ -13,7 +13,7 @@ MOST_JOINTS = 500
 MOST_BODIES = 2_000
 MOST_ELEMENTS = 20_000
 """Elements of a model, each with as many copies as <replicate> and <attach> make of it."""
-MOST_PIXELS = 2**26
+MOST_PIXELS = 2**28
 """Of all pictures of a model together."""
 MOST_ASSET_BYTES = 500_000_000
 """Of all meshes and pictures of a model together."""

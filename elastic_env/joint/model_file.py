@@ -273,7 +273,7 @@ def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
 def _without_lost_meshes(spec: mujoco.MjSpec, name: str) -> ReadModel:
     """A specification that compiles: without its meshes and pictures, where these are why it does not."""
     try:
-        return ReadModel(spec, compiled_spec(spec.copy(), name), name, [])
+        return ReadModel(spec, _compiled_with_keys(spec, name), name, [])
     except ConfigurationError as error:
         problem = error
     lost = [element.file or element.name for element in (*spec.meshes, *spec.textures)]
@@ -285,7 +285,7 @@ def _without_lost_meshes(spec: mujoco.MjSpec, name: str) -> ReadModel:
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
         for body in heavy:  # of any mass: would it compile if the meshes were there?
             body.mass, body.inertia, body.explicitinertial = 1.0, np.ones(3), True
-    model = compiled_spec(spec.copy(), name)
+    model = _compiled_with_keys(spec, name)
     if heavy:
         raise ConfigurationError(
             f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give the body an "
@@ -294,18 +294,38 @@ def _without_lost_meshes(spec: mujoco.MjSpec, name: str) -> ReadModel:
     return ReadModel(spec, model, name, lost)
 
 
+def _compiled_with_keys(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
+    """A copy compiled. Copies hide keyframes of a wrong size, which are refused."""
+    model = compiled_spec(spec.copy(), name)
+    for key in spec.keys:
+        for what, values, size in (
+            ("qpos", key.qpos, model.nq), ("qvel", key.qvel, model.nv), ("act", key.act, model.na),
+            ("ctrl", key.ctrl, model.nu),
+        ):  # fmt: skip
+            if len(values) not in (0, size):
+                raise ConfigurationError(
+                    f"keyframe {shown(key.name)} of {name} has {len(values)} values of {what}; the model needs {size}"
+                )
+    return model
+
+
 def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     """Bodies that have their mass from a mesh."""
     from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     return [
         body
         for body in spec.bodies[1:]
-        if any(geom.type == _MESH for geom in body.geoms) and (from_geoms or not body.explicitinertial)
+        if any(_is_of_mesh(geom) for geom in body.geoms) and (from_geoms or not body.explicitinertial)
     ]
 
 
+def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:
+    """Whether a geom is a mesh, or a primitive that is fitted to one."""
+    return geom.type == _MESH or bool(geom.meshname)
+
+
 def _take_meshes(spec: mujoco.MjSpec) -> None:
-    for geom in [geom for geom in spec.geoms if geom.type == _MESH]:
+    for geom in [geom for geom in spec.geoms if _is_of_mesh(geom)]:
         spec.delete(geom)
     for material in spec.materials:
         material.textures = [""] * len(material.textures)

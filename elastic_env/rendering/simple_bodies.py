@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.joint.model_file import compiled_spec
 
 _RADIUS = 0.02
 """Of a rod, over the size of the robot."""
@@ -20,7 +19,7 @@ def add_simple_bodies(spec: mujoco.MjSpec) -> None:
     Args:
         spec: It is changed. It has to compile.
     """
-    model = compiled_spec(spec.copy(), "the model")
+    model = spec.copy().compile()
     radius = _RADIUS * float(np.linalg.norm(model.body_pos, axis=1).sum())
     for body in [body for body in spec.bodies if not body.geoms]:
         ends = [model.body_pos[c] for c in np.flatnonzero(model.body_parentid == body.id) if c != body.id]
