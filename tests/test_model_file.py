@@ -205,7 +205,8 @@ def test_xacro_has_to_be_expanded_first(text: str) -> None:
         (mjcf(head='<option><flag spring="disable"/></option>'), r'<flag spring="disable"/>'),
         (mjcf(head='<option wind="9 0 0" density="1.2"/>'), r"has wind, whose force on the links"),
         (mjcf(first='axis2="1"'), r"unrecognized attribute"),
-        (mjcf(also='<keyframe><key qpos="1"/></keyframe>'), r"keyframe '' .* has 1 values of qpos; the model needs 2"),
+        (mjcf(also='<keyframe><key qpos="1 2 3"/></keyframe>'), r"invalid qpos size, expected 2, got 3"),
+        (mjcf(also='<equality><connect body1="a" body2="lost" anchor="0 0 0"/></equality>'), r"unknown element 'lost'"),
         (mjcf(first='name="j1" axis="0 1 0"/><joint name="j0"'), r"links that j., j. move have no inertia.*one axis"),
         (mjcf(first=""), r"a hinge of the model has no name; give each one"),
         (mjcf(first='type="free"').replace('axis="0 1 0"', "", 1), r"free or a ball joint"),
@@ -436,3 +437,10 @@ def test_ctrl_c_reaches_a_long_compilation() -> None:
     _, said = process.communicate(timeout=20.0)
     assert b"KeyboardInterrupt" in said
     assert process.returncode != 0
+
+
+def test_warnings_of_mujoco_write_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches MUJOCO_LOG.TXT in the folder of a user."""
+    monkeypatch.chdir(tmp_path)
+    compiled_model(urdf(also=FINGERS.replace('"finger_r" type="revolute"', '"finger_r" type="fixed"')))
+    assert list(tmp_path.iterdir()) == []

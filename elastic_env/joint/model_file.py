@@ -90,7 +90,7 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
         ConfigurationError: It cannot be read or compiled, it is beyond the bounds, or a mass comes from a lost mesh.
     """
     if isinstance(model, mujoco.MjSpec):
-        return _without_lost_meshes(from_mujoco(model.copy, _SPECIFICATION, "copy"), _SPECIFICATION)
+        return _without_lost_meshes(lambda: from_mujoco(model.copy, _SPECIFICATION, "copy"), _SPECIFICATION)
     if isinstance(model, mujoco.MjModel):
         raise ConfigurationError(
             "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf), or its "
@@ -103,7 +103,7 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
         )
     text = read_model_text(model)
     require_bounds(text)
-    return _of_urdf(text, shapes) if text.is_urdf else _without_lost_meshes(_mjcf_spec(text), text.name)
+    return _of_urdf(text, shapes) if text.is_urdf else _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
 
 
 def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
@@ -270,12 +270,17 @@ def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
     return spec
 
 
-def _without_lost_meshes(spec: mujoco.MjSpec, name: str) -> ReadModel:
-    """A specification that compiles: without its meshes and pictures, where these are why it does not."""
+def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
+    """A specification that compiles: without its meshes and pictures, where these are why it does not.
+
+    What is compiled is read for that alone: a copy of a specification hides elements whose references are wrong.
+    """
     try:
-        return ReadModel(spec, _compiled_with_keys(spec, name), name, [])
+        model = compiled_spec(read(), name)
+        return ReadModel(read(), model, name, [])
     except ConfigurationError as error:
         problem = error
+    spec = read()
     lost = [element.file or element.name for element in (*spec.meshes, *spec.textures)]
     if not lost:
         raise problem
@@ -285,28 +290,13 @@ def _without_lost_meshes(spec: mujoco.MjSpec, name: str) -> ReadModel:
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
         for body in heavy:  # of any mass: would it compile if the meshes were there?
             body.mass, body.inertia, body.explicitinertial = 1.0, np.ones(3), True
-    model = _compiled_with_keys(spec, name)
+    model = compiled_spec(spec.copy(), name)
     if heavy:
         raise ConfigurationError(
             f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give the body an "
             f"<inertial>, or bring the mesh. {problem}"
         )
     return ReadModel(spec, model, name, lost)
-
-
-def _compiled_with_keys(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
-    """A copy compiled. Copies hide keyframes of a wrong size, which are refused."""
-    model = compiled_spec(spec.copy(), name)
-    for key in spec.keys:
-        for what, values, size in (
-            ("qpos", key.qpos, model.nq), ("qvel", key.qvel, model.nv), ("act", key.act, model.na),
-            ("ctrl", key.ctrl, model.nu),
-        ):  # fmt: skip
-            if len(values) not in (0, size):
-                raise ConfigurationError(
-                    f"keyframe {shown(key.name)} of {name} has {len(values)} values of {what}; the model needs {size}"
-                )
-    return model
 
 
 def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
@@ -345,8 +335,14 @@ def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
             errors.append(error)
 
     thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    thread.join()
+    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_file = False  # no MUJOCO_LOG.TXT in the folder of a user
+    silent.set()
+    try:
+        thread.start()
+        thread.join()
+    finally:
+        before.set()
     if errors:
         raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {_with_cure(errors[0])}") from None
     return results[0]
