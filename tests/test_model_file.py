@@ -20,6 +20,7 @@ from elastic_env import ElasticJoint, make_elastic
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.known_torque import coupled_fingers
 from elastic_env.joint.model_file import compiled_model, read_model
+from train.experiments.robot import RobotTrial, robot_arguments, write_robot
 
 INERTIAL = (
     '<inertial><origin xyz="0 0 0.15"/><mass value="{}"/>'
@@ -207,7 +208,10 @@ def test_xacro_has_to_be_expanded_first(text: str) -> None:
         (mjcf(first='axis2="1"'), r"unrecognized attribute"),
         (mjcf(also='<keyframe><key qpos="1 2 3"/></keyframe>'), r"invalid qpos size, expected 2, got 3"),
         (mjcf(also='<equality><connect body1="a" body2="lost" anchor="0 0 0"/></equality>'), r"unknown element 'lost'"),
-        (mjcf(first='name="j1" axis="0 1 0"/><joint name="j0"'), r"links that j., j. move have no inertia.*one axis"),
+        (
+            mjcf(first='name="j1" axis="0 1 0"/><joint name="j0"'),
+            r"links that j. and j. move have no inertia.*one axis",
+        ),
         (mjcf(first=""), r"a hinge of the model has no name; give each one"),
         (mjcf(first='type="free"').replace('axis="0 1 0"', "", 1), r"free or a ball joint"),
         (b"<robot/>", r"a model must be a file .*, got b'<robot/>'"),
@@ -444,3 +448,15 @@ def test_warnings_of_mujoco_write_no_file(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     compiled_model(urdf(also=FINGERS.replace('"finger_r" type="revolute"', '"finger_r" type="fixed"')))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_takes_the_text_of_a_model_and_does_not_print_it(tmp_path: Path) -> None:
+    """Catches a mark or a declared encoding that the written file does not have, and a flood on the terminal."""
+    text = urdf(head='\ufeff<?xml version="1.0" encoding="gbk"?>\n')
+    arguments = robot_arguments(RobotTrial(model=text, stiffness=400.0))
+    file = write_robot(arguments, tmp_path)
+    np.testing.assert_allclose(torque(tmp_path / "model.xml"), TORQUE, rtol=1e-7)
+    assert file.name == "robot.yaml"
+    with pytest.raises(ConfigurationError) as error:
+        robot_arguments(RobotTrial(model="x" * 5_000, stiffness=400.0))
+    assert len(str(error.value)) < 700

@@ -345,7 +345,7 @@ def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
         smallest.append((values[0], vectors[:, 0]))
     value, vector = max(smallest, key=lambda pair: pair[0])
     if value < _SINGULAR:
-        names = _listed([joints[i] for i in np.argsort(-np.abs(vector))[:2]])
+        names = " and ".join(joints[int(i)] for i in np.argsort(-np.abs(vector))[:2])
         raise ConfigurationError(
             f"the links that {names} move have no inertia of their own, or two joints have one axis; give each link "
             "between two joints its mass and inertia, and each joint its own axis"

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -90,7 +90,8 @@ def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
         ConfigurationError: It cannot be read or compiled, it is beyond the bounds, or a mass comes from a lost mesh.
     """
     if isinstance(model, mujoco.MjSpec):
-        return _without_lost_meshes(lambda: from_mujoco(model.copy, _SPECIFICATION, "copy"), _SPECIFICATION)
+        given: Any = model
+        return _without_lost_meshes(lambda: from_mujoco(given.copy, _SPECIFICATION, "copy"), _SPECIFICATION)
     if isinstance(model, mujoco.MjModel):
         raise ConfigurationError(
             "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf), or its "

@@ -23,9 +23,11 @@ DEEPEST = 200
 LONGEST_NAME = 200
 """Characters of a name or path that an error prints."""
 
+_BLANK = "\ufeff \t\r\n"
 _KINDS = ("mujoco", "robot")
 _FILE = "give a file of MJCF (.xml) or URDF (.urdf)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]{0,200}?encoding\s*=\s*["']([A-Za-z0-9._-]{1,40})["']""")
+_DECLARATION = re.compile(r"^<\?xml[^>]*\?>")
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -77,8 +79,8 @@ def read_model_text(model: str | Path) -> ModelText:
     Raises:
         ConfigurationError: There is no such file, it is too large, no XML or no model, or it has to be expanded first.
     """
-    if isinstance(model, str) and model.lstrip("\ufeff \t\r\n").startswith("<"):
-        name, text = "the text of the model", model.lstrip("\ufeff \t\r\n")
+    if is_text(model):
+        name, text = "the text of the model", str(model).lstrip(_BLANK)
         if len(text) > LARGEST_BYTES:
             raise ConfigurationError(f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}")
         found = ModelText(parse_xml(text, name), name, Path.cwd(), None, text, is_utf8=True)
@@ -86,6 +88,24 @@ def read_model_text(model: str | Path) -> ModelText:
         found = _of_file(Path(model))
     _require_model(found)
     return found
+
+
+def is_text(model: object) -> bool:
+    """Whether a model is given as its text rather than as a file."""
+    return isinstance(model, str) and model.lstrip(_BLANK).startswith("<")
+
+
+def without_declaration(text: str) -> str:
+    """The text of a model for a file in UTF-8: without mark, and without the encoding that it had once."""
+    return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
+
+
+def is_file(path: str | Path) -> bool:
+    """Whether there is a regular file, for any path: one that no file can have is none."""
+    try:
+        return Path(path).is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def name_of(path: str | Path) -> str:
