@@ -210,7 +210,7 @@ def test_xacro_has_to_be_expanded_first(text: str) -> None:
         (mjcf(also='<equality><connect body1="a" body2="lost" anchor="0 0 0"/></equality>'), r"unknown element 'lost'"),
         (
             mjcf(first='name="j1" axis="0 1 0"/><joint name="j0"'),
-            r"links that j. and j. move have no inertia.*one axis",
+            r"that j. and j. move have no inertia.*one axis",
         ),
         (mjcf(first=""), r"a hinge of the model has no name; give each one"),
         (mjcf(first='type="free"').replace('axis="0 1 0"', "", 1), r"free or a ball joint"),

@@ -13,7 +13,7 @@ from elastic_env.core.errors import ConfigurationError, require_known, shown
 from elastic_env.core.signals import Array
 from elastic_env.joint.model_file import require_sound
 
-MOST_ELASTIC = 100
+MOST_ELASTIC = 80
 """Joints that are commanded; whether the physics follows them takes a time that grows with their cube."""
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
