@@ -460,3 +460,14 @@ def test_the_command_takes_the_text_of_a_model_and_does_not_print_it(tmp_path: P
     with pytest.raises(ConfigurationError) as error:
         robot_arguments(RobotTrial(model="x" * 5_000, stiffness=400.0))
     assert len(str(error.value)) < 700
+
+
+def test_more_elastic_joints_than_can_be_simulated_are_refused() -> None:
+    """Catches eigenvalues of a matrix that takes minutes."""
+    bodies = "".join(f'<body><joint name="k{i}" axis="0 1 0"/>{ROD}</body>' for i in range(90))
+    model = f'<mujoco><worldbody><body name="a"/>{bodies}</worldbody></mujoco>'
+    joint = ElasticJoint(stiffness=400.0, damping=4.0, rotor_inertia=0.1)
+    said = refusals(model)
+    with pytest.raises(ConfigurationError) as error:
+        make_elastic(model, {f"k{i}": joint for i in range(90)})
+    assert {*said, str(error.value)} == {"at most 80 joints can be elastic, got 90; name those that matter"}

@@ -122,6 +122,18 @@ def require_fixed_base(model: mujoco.MjModel) -> None:
             )
 
 
+def require_few(joints: Collection[str]) -> None:
+    """Refuse more elastic joints than can be simulated.
+
+    Raises:
+        ConfigurationError: There are more than `MOST_ELASTIC`.
+    """
+    if len(joints) > MOST_ELASTIC:
+        raise ConfigurationError(
+            f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}; name those that matter"
+        )
+
+
 def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
     """Refuse a model in which something acts on the commanded joints that is not known in advance.
 
@@ -178,11 +190,7 @@ def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
     require_known("joint", joints, known)
     if len(set(joints)) != len(joints) or not joints:
         raise ConfigurationError(f"joints must name at least one joint, and each once, got {shown(list(joints))}")
-    if len(joints) > MOST_ELASTIC:
-        raise ConfigurationError(
-            f"at most {MOST_ELASTIC} joints can be commanded, got {len(joints)}; name those that matter, "
-            "the others are held"
-        )
+    require_few(joints)
     for name in joints:
         if model.jnt_type[known[name]] != _HINGE:
             raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; elastic joints are hinges")

@@ -25,6 +25,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import link_name, motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import give_keyframes, take_keyframes
+from elastic_env.joint.known_torque import require_few
 from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
 
@@ -78,6 +79,7 @@ def make_elastic(
     Warns:
         UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its actuators.
     """
+    require_few(joints)
     elastic = transformed(read_model(spec).spec, joints, form, actuators)
     elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     _choose_integrator(elastic)
