@@ -21,12 +21,13 @@ from elastic_env.core.signals import Array
 from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
+from elastic_env.joint.known_torque import hinges_of
 from elastic_env.joint.make_elastic import make_elastic, transformed
 from elastic_env.joint.model_file import keep_shapes, urdf_spec
 from elastic_env.joint.time_step import largest_stable_timestep
 from elastic_env.rendering.simple_bodies import add_simple_bodies
 from elastic_env.robots import gallery
-from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot, hinge_names, home_pose
+from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot, home_pose
 from tests.gallery_files import FOLDER, PACKAGED, excerpt
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")
@@ -56,7 +57,7 @@ def sides(model: mujoco.MjModel, hinges: list[str]) -> tuple[list[int], list[int
 @pytest.mark.parametrize("name", GALLERY)
 def test_a_robot_with_elastic_hinges_moves_for_ten_seconds(name: str) -> None:
     """Catches a hinge that stayed rigid, a spring that explodes or swings up, and a reset that would hide it."""
-    model, hinges = elastic(name), hinge_names(rigid(name))
+    model, hinges = elastic(name), hinges_of(rigid(name))
     assert len(hinges) == rigid(name).nv == model.ntendon
     data, home = mujoco.MjData(model), home_pose(name, hinges)
     rotors, links = sides(model, hinges)
@@ -80,7 +81,7 @@ def test_the_limit_of_rigid_joints_is_the_model_as_it_was(name: str) -> None:
     For K → ∞ the deflection vanishes, and what is left is Tᵀ M T q̈ = Tᵀ f. q̈ must be that of MuJoCo for the model as
     it was, with the rotors' inertia as armature, pushed by the same torques.
     """
-    model, stiff, hinges = copy.copy(rigid(name)), elastic(name), hinge_names(rigid(name))
+    model, stiff, hinges = copy.copy(rigid(name)), elastic(name), hinges_of(rigid(name))
     expected, data = mujoco.MjData(model), mujoco.MjData(stiff)
     rotors, links = sides(stiff, hinges)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
@@ -104,7 +105,7 @@ def test_the_limit_of_rigid_joints_is_the_model_as_it_was(name: str) -> None:
 @pytest.mark.parametrize("name", ["panda", "ur5", "talos_arm", "so101", "pusher"])
 def test_stiffer_joints_move_ever_more_like_rigid_ones(name: str) -> None:
     """Catches a limit that is right on paper and not in motion: ten times the stiffness is a tenth of the deviation."""
-    hinges, joints = hinge_names(rigid(name)), gallery_joints(name, FOLDER)
+    hinges, joints = hinges_of(rigid(name)), gallery_joints(name, FOLDER)
 
     def fallen(form: str, scale: float, timestep_s: float | None = None) -> Array:
         """Link angles after a fall of 50 ms from home."""
@@ -139,7 +140,7 @@ def test_everybody_computes_the_same_gravity_torque(name: str) -> None:
     """Catches a mass, an axis or a frame that is lost between URDF, MuJoCo, Pinocchio and our tree."""
     model = rigid(name)
     hinges, data, poses = (
-        hinge_names(model),
+        hinges_of(model),
         mujoco.MjData(model),
         gallery.random_poses(model, np.random.default_rng(3), 10),
     )

@@ -328,7 +328,7 @@ LINK = """<robot name="r"><link name="base"/><link name="arm"><inertial><mass va
 def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
     """Catches a traceback of MuJoCo or of an XML parser, and a message that does not say what to do."""
     (tmp_path / "there.dae").write_text("<COLLADA/>")
-    with pytest.raises(ConfigurationError, match="a model must be a file, an MjSpec or an MjModel, got None"):
+    with pytest.raises(ConfigurationError, match=r"a model must be a file of MJCF .*mujoco.MjModel, got None"):
         PositionCompensator.from_model(None, 900.0)  # type: ignore[arg-type]
     for text, message in (
         (None, "no model at"), ("{", "is no XML"), ("<mujoco><bdy/></mujoco>", "MuJoCo cannot read"),

@@ -24,7 +24,13 @@ from elastic_env.core.errors import ActionError, ConfigurationError, ElasticErro
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.joint_settings import HELD, RIGID, SOFTEST, JointSettings, ServoSettings, key_of, read_joints
-from elastic_env.joint.model_file import compiled_model
+from elastic_env.joint.known_torque import (
+    commanded_hinges,
+    hinges_of,
+    home_of,
+    require_known_torque,
+)
+from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.motion.trajectory import minimum_jerk
 
@@ -86,14 +92,16 @@ class PositionCompensator:
         period_s: float = 0.01,
     ) -> None:
         self._model = model
-        hinges = _hinges(model) if joints is None else list(joints)
         known = _known_joints(model, stiffness, joints)
-        is_held = [known is not None and name in known and known[name] is None for name in hinges]
-        self.joints = tuple(name for name, out in zip(hinges, is_held, strict=True) if joints is not None or not out)
-        if hinges and not self.joints:
-            raise ConfigurationError(f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]")
+        if joints is None:
+            hinges = commanded_hinges(model, stiffness if isinstance(stiffness, Mapping) else ())
+            held_by_name = [] if known is None else [name for name, own in known.items() if own is None]
+            joints = [name for name in hinges if name not in held_by_name]
+            if not joints:
+                raise ConfigurationError(f"all joints are {HELD}; give at least one of them its stiffness K [N·m/rad]")
+        self.joints = tuple(joints)
+        require_known_torque(model, self.joints)
         held = _held(model, self.joints)
-        _require_known_torque(model, held)
         self._links = TreeTorque(model, self.joints, held)
         at = [int(model.joint(name).id) for name in self.joints]
         limited = model.jnt_limited[at].astype(bool)
@@ -106,7 +114,7 @@ class PositionCompensator:
             settings = _settings_of(known, self.joints)
             servos = [one.servo for one in settings]
             self._compliance = 1.0 / np.array([one.stiffness for one in settings])
-        _require_patterns_that_fit(position_gain, [*self.joints, *held])
+        _require_patterns_that_fit(position_gain, _joint_names(model))
         self._of_command = self._compliance + 1.0 / _servo_gains(model, self.joints, servos, position_gain)
         self._limit, self._ramp = _number("limit_rad", limit_rad, "rad"), _number("ramp_s", ramp_s, "s", least=0.0)
         self._steps = max(int(np.ceil(self._ramp / _number("period_s", period_s, "s"))), 1)
@@ -116,10 +124,8 @@ class PositionCompensator:
         self._warn_of_room()
 
     @classmethod
-    def from_model(
-        cls, model: str | Path | mujoco.MjSpec | mujoco.MjModel, stiffness: PerJoint | str | Path, **options: Any
-    ) -> Self:
-        """From a file of MJCF or URDF, or from what MuJoCo made of one; further arguments as of the class.
+    def from_model(cls, model: GivenModel, stiffness: PerJoint | str | Path, **options: Any) -> Self:
+        """From a file of MJCF or URDF, its text, or what MuJoCo made of one; further arguments as of the class.
 
         `stiffness` may be a YAML file, such as the `joints.yaml` of `elastic identify --robot`. Hinges that such a file
         does not name are rigid, as those are that were not identified.
@@ -365,54 +371,14 @@ def _in_body(model: mujoco.MjModel, site: int, place: Array) -> Array:
     return model.site_pos[site] + turned
 
 
-def _hinges(model: mujoco.MjModel) -> list[str]:
-    names = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    if not names:
-        raise ConfigurationError("the model has no hinge; a compensator needs a robot with rotary joints")
-    if not all(names):
-        raise ConfigurationError("a hinge of the model has no name; give each one, the stiffness is by name")
-    return names
+def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, float]:
+    """Positions of the joints that are not commanded, by their number [rad], [m]."""
+    home = home_of(model)
+    return {j: float(home[model.jnt_qposadr[j]]) for j in range(model.njnt) if model.joint(j).name not in joints}
 
 
-def _held(model: mujoco.MjModel, joints: Sequence[str]) -> dict[str, float]:
-    """Positions of the joints that are not commanded [rad], [m]."""
-    known = [model.joint(j).name for j in range(model.njnt)]
-    require_known("joint", joints, known)
-    if len(set(joints)) != len(joints) or not joints:
-        raise ConfigurationError(f"joints must name at least one joint, and each once, got {shown(list(joints))}")
-    home = model.key_qpos[0] if model.nkey else model.qpos0
-    held = {}
-    for j, name in enumerate(known):
-        if int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)):
-            raise ConfigurationError(
-                f"joint {name!r} is free or a ball joint; a compensator needs a fixed base and hinges: the torque of a "
-                "floating robot depends on its contacts"
-            )
-        if name not in joints:
-            held[name] = float(home[model.jnt_qposadr[j]])
-    return held
-
-
-def _require_known_torque(model: mujoco.MjModel, held: Mapping[str, float]) -> None:
-    """Refuse what adds to the torque and is not in it: closed loops, springs of tendons, non-linear springs."""
-    for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
-        if (name := model.joint(int(j)).name) not in held:
-            raise ConfigurationError(
-                f"joint {name!r} has a spring whose torque is not linear, which is not compensated; give it one number"
-            )
-    for i in range(model.neq):
-        of_joints = model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT
-        names = (
-            [model.joint(int(j)).name for j in (model.eq_obj1id[i], model.eq_obj2id[i]) if j >= 0] if of_joints else []
-        )
-        if not of_joints or any(name not in held for name in names):
-            which = f"of {' and '.join(names)}" if names else "of bodies or tendons"
-            raise ConfigurationError(
-                f"the model has an equality constraint {which}, whose torque is not known in advance; take it out, or "
-                "leave its joints out of `joints`"
-            )
-    if model.tendon_stiffness.any() or model.tendon_stiffnesspoly.any():
-        raise ConfigurationError("the model has tendons with stiffness, whose torque is not compensated; take them out")
+def _joint_names(model: mujoco.MjModel) -> list[str]:
+    return [name for j in range(model.njnt) if (name := model.joint(j).name)]
 
 
 def _of_file(model: mujoco.MjModel, file: Path, commanded: Sequence[str] | None) -> dict[str, Any]:
@@ -437,9 +403,8 @@ def _known_joints(
     """Settings by joint, None for one that is held; None where numbers alone are given."""
     if not isinstance(given, Mapping):
         return None
-    names = [model.joint(j).name for j in range(model.njnt)]
-    hinges = [name for j, name in enumerate(names) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and name]
-    known = read_joints(given, hinges, [name for name in names if name not in hinges])
+    hinges = hinges_of(model)
+    known = read_joints(given, hinges, [name for name in _joint_names(model) if name not in hinges])
     for name in commanded or ():
         if name in known and known[name] is None:
             raise ConfigurationError(

@@ -120,11 +120,6 @@ class StaticArm:
         return found
 
 
-def hinges_of(model: mujoco.MjModel) -> list[str]:
-    """Names of the hinges of a model."""
-    return [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-
-
 def _rows(compensator: PositionCompensator, q: Array) -> Array:
     return np.array([compensator.torque(row) for row in q])
 

@@ -21,6 +21,7 @@ from baselines import PositionCompensator  # noqa: E402
 from elastic_env.core.signals import Array  # noqa: E402
 from elastic_env.dynamics.tree.torque import TreeTorque  # noqa: E402
 from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
+from elastic_env.joint.known_torque import hinges_of  # noqa: E402
 from elastic_env.rendering.picture import Image  # noqa: E402
 from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402
@@ -28,7 +29,6 @@ from elastic_env.robots.gallery import (  # noqa: E402
     GALLERY,
     gallery_joints,
     gallery_robot,
-    hinge_names,
     home_pose,
     random_poses,
 )
@@ -84,7 +84,7 @@ class AtRest:
         self.name = name
         self.model = gallery_robot(name, folder).compile()
         self.joints = gallery_joints(name, folder)
-        self.hinges = hinge_names(self.model)
+        self.hinges = hinges_of(self.model)
         self.stiffness = np.array([self.joints[hinge].stiffness for hinge in self.hinges])
         self._torque = TreeTorque(self.model, self.hinges)
         self._compensator = PositionCompensator(self.model, self.stiffness.tolist())

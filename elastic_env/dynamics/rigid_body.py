@@ -19,7 +19,7 @@ class RigidBody:
     Args:
         model: Compiled rigid model.
         joints: Hinges of the model, in the order of the last axis.
-        held: Position of every other joint, a hinge [rad] or a slide [m].
+        held: Position of every other joint by name or number, a hinge [rad] or a slide [m].
         gravcomp: Whether `gravcomp` of the bodies takes from their weight.
 
     Raises:
@@ -30,7 +30,7 @@ class RigidBody:
         self,
         model: mujoco.MjModel,
         joints: Sequence[str],
-        held: Mapping[str, float] | None = None,
+        held: Mapping[str, float] | Mapping[int, float] | None = None,
         gravcomp: bool = False,
     ) -> None:
         held = held or {}
@@ -88,13 +88,14 @@ class RigidBody:
         self.inverse_dynamics(zero, zero, zero)
 
 
-def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str] = ()) -> None:
-    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints.
+def require_hinge_tree(model: mujoco.MjModel, joints: Sequence[str], but: Sequence[str | int] = ()) -> None:
+    """Check that a rigid model moves by the named hinges and nothing else, `but` some joints by name or number.
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
-    kinds = {model.joint(j).name: model.jnt_type[j] for j in range(model.njnt) if model.joint(j).name not in but}
+    others = [j for j in range(model.njnt) if j not in but and model.joint(j).name not in but]
+    kinds = {model.joint(j).name: model.jnt_type[j] for j in others}
     names = list(kinds)
     for name, kind in kinds.items():
         if kind != mujoco.mjtJoint.mjJNT_HINGE:

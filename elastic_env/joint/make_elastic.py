@@ -14,6 +14,7 @@ Friction acts on the link side of the spring, the servo and all actuators of the
 
 import warnings
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Literal, get_args
 
 import mujoco
@@ -24,6 +25,8 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.joint_names import link_name, motor_name, servo_name, spring_name
 from elastic_env.joint.keyframes import give_keyframes, take_keyframes
+from elastic_env.joint.known_torque import require_few
+from elastic_env.joint.model_file import compiled_spec, read_model
 from elastic_env.joint.time_step import is_stable, largest_stable_timestep, with_room
 
 Form = Literal["tendon", "series", "rigid"]
@@ -39,7 +42,7 @@ _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 def make_elastic(
-    spec: mujoco.MjSpec,
+    spec: str | Path | mujoco.MjSpec,
     joints: Mapping[str, ElasticJoint],
     form: Form = "tendon",
     actuators: ActuatorRule = "keep",
@@ -57,7 +60,8 @@ def make_elastic(
     for which that is small.
 
     Args:
-        spec: Any specification with hinges; it is not changed. Set its physics step before.
+        spec: Any specification with hinges, a file of MJCF or URDF, or the text of one, see `read_model`. It is not
+            changed. Set its physics step before.
         joints: Parameters by hinge name.
         form: "tendon", "series" or "rigid", see the module.
         actuators: "keep" moves the actuators of a hinge to its rotor and adds the servo only where there is none;
@@ -67,14 +71,16 @@ def make_elastic(
         The elastic specification, ready to compile.
 
     Raises:
-        ConfigurationError: Unknown form or hinge, a joint that is no hinge, a name that is already taken, or
-            parameters that the series form cannot represent. Or `implicitfast` does not follow the joints either at
-            the physics step of the model; the message names the largest step at which it does.
+        ConfigurationError: The model cannot be read or compiled; unknown form or hinge, a joint that is no hinge, a
+            name that is already taken, or parameters that the series form cannot represent. Or `implicitfast` does not
+            follow the joints either at the physics step of the model; the message names the largest step at which it
+            does.
 
     Warns:
         UserWarning: The integrator was changed, or a servo is left out because the hinge keeps its actuators.
     """
-    elastic = transformed(spec, joints, form, actuators)
+    require_few(joints)
+    elastic = transformed(read_model(spec).spec, joints, form, actuators)
     elastic.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     _choose_integrator(elastic)
     return elastic
@@ -100,7 +106,7 @@ def transformed(
 
 def _choose_integrator(spec: mujoco.MjSpec) -> None:
     """Let the integrator be `implicitfast` where the model's own does not follow the joints; refuse if neither does."""
-    model = spec.compile()
+    model = compiled_spec(spec, "the elastic model")
     if is_stable(model):
         return
     tried = [mujoco.mjtIntegrator(model.opt.integrator), _IMPLICITFAST]
@@ -124,7 +130,7 @@ def _resolve_springdampers(spec: mujoco.MjSpec, joints: list[str]) -> None:
     """Write out springs that are given as time constants: they follow from inertias that the transform changes."""
     given = [j for j in spec.joints if j.name in joints and np.any(j.springdamper)]
     if given:
-        model = spec.compile()
+        model = compiled_spec(spec, "the specification")
         for hinge in given:
             compiled = model.joint(hinge.name)
             hinge.stiffness = np.array([compiled.stiffness[0], 0.0, 0.0])

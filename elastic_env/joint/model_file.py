@@ -1,100 +1,154 @@
-"""Rigid models from files that others wrote, MJCF and URDF."""
+"""The one reader of rigid models that others wrote: MJCF and URDF, files and texts, specifications, compiled models.
 
+Whoever reads a model reads it here, so that all accept and refuse the same ones, in the same words.
+"""
+
+import copy
+import threading
 import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import mujoco
+import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, shortened, shown
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.joint.model_bounds import require_bounds
+from elastic_env.joint.model_text import LARGEST_BYTES, ModelText, read_model_text
 
-_LARGEST_BYTES = 50_000_000
+GivenModel = str | Path | mujoco.MjSpec | mujoco.MjModel
+"""A file of MJCF (.xml) or URDF (.urdf), the text of one, a specification, or what MuJoCo compiled."""
+
+Result = TypeVar("Result")
+
+_SPECIFICATION = "the specification"
 _CURES = {
     "mass and inertia of moving bodies": "every link that moves needs a mass [kg] and an inertia [kg·m²] above zero",
     "inertia must": "the inertia must be that of a body: positive, and no main value above the sum of the other two",
+    "inertia matrix": "the inertia must be that of a body: positive, and no main value above the sum of the other two",
     "Error opening file": "put the mesh where the model names it, or take its shape out and give the link's inertia",
     "no decoder found": "MuJoCo reads meshes of STL, OBJ and MSH; convert it, or take its shape out",
     "bad format in attribute": "it must be a number",
+    "range[0] should be smaller": "the lower limit must be below the upper one",
+    "Could not allocate memory": "make the sizes in <size> smaller",
 }
 """What to do about errors of MuJoCo, by a part of their text."""
+_LONGEST_ERROR = 400
 _SHAPES, _READABLE, _PACKAGE = ("visual", "collision"), (".stl", ".obj"), "package://"
+_MESH = mujoco.mjtGeom.mjGEOM_MESH
+_URDF_OPTIONS = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
+_OF_FILES = ("meshdir", "texturedir", "assetdir")
 
 
-def compiled_model(model: "str | Path | mujoco.MjSpec | mujoco.MjModel") -> mujoco.MjModel:
+@dataclass(frozen=True)
+class ReadModel:
+    """A model as it was read.
+
+    Attributes:
+        spec: Its specification, which compiles.
+        model: What MuJoCo makes of that.
+        name: What errors call it.
+        lost: Meshes that are not in it, since they are missing or MuJoCo cannot read them.
+    """
+
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel
+    name: str
+    lost: list[str]
+
+
+def compiled_model(model: GivenModel) -> mujoco.MjModel:
     """A compiled rigid model.
 
     Shapes of a URDF are left out, so that no mesh has to be there; links that are fixed to others keep their names.
 
     Args:
-        model: File of MJCF (.xml) or URDF (.urdf), or what MuJoCo made of one.
+        model: See `GivenModel`.
 
     Raises:
         ConfigurationError: There is no such file, or MuJoCo cannot read or compile it.
     """
     if isinstance(model, mujoco.MjModel):
+        require_sound(model, "the model")
         return model
-    if isinstance(model, mujoco.MjSpec):
-        return compiled_spec(model, "the specification")
-    if not isinstance(model, str | Path):
-        raise ConfigurationError(f"a model must be a file, an MjSpec or an MjModel, got {shown(model)}")
-    path = Path(model)
-    root = xml_of(path)
-    if root.tag != "robot":
-        return compiled_spec(mjcf_spec(path), str(path))
-    keep_shapes(root, None)
-    return compiled_spec(urdf_spec(root, str(path)), str(path))
+    return read_model(model).model
 
 
-def xml_of(path: Path) -> ET.Element:
-    """What a file of MJCF or URDF holds.
+def read_model(model: GivenModel, shapes: bool = False) -> ReadModel:
+    """The specification of a rigid model, which compiles.
 
-    Raises:
-        ConfigurationError: There is no such file, it is too large, or it is no XML.
-    """
-    if not path.is_file():
-        raise ConfigurationError(f"no model at {shortened(path)}; give a file of MJCF (.xml) or URDF (.urdf)")
-    if path.stat().st_size > _LARGEST_BYTES:
-        raise ConfigurationError(f"{path} must have at most {_LARGEST_BYTES} bytes, it has {path.stat().st_size}")
-    try:
-        return ET.parse(path).getroot()
-    except (ET.ParseError, UnicodeDecodeError, OSError) as error:
-        raise ConfigurationError(f"{path} is no XML: {error}; give a file of MJCF (.xml) or URDF (.urdf)") from None
-
-
-def mjcf_spec(path: Path) -> mujoco.MjSpec:
-    """The specification that a file of MJCF holds.
-
-    Raises:
-        ConfigurationError: MuJoCo cannot read it.
-    """
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot read {path}: {_with_cure(error)}") from None
-
-
-def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
-    """The specification of a URDF. Links that are fixed to others keep their names; shapes weigh and touch nothing.
+    Shapes of a URDF weigh and touch nothing. A mesh that is missing is left out where no mass comes from it.
 
     Args:
-        robot: Root of the URDF with shapes that MuJoCo reads, see `keep_shapes`; it is changed.
-        name: What errors call it.
+        model: See `GivenModel`; a compiled model has no specification. It is not changed.
+        shapes: Whether the shapes of a URDF are wanted, for pictures.
 
     Raises:
-        ConfigurationError: MuJoCo cannot read it.
+        ConfigurationError: It cannot be read or compiled, it is beyond the bounds, or a mass comes from a lost mesh.
     """
-    for own in robot.findall("mujoco"):
-        robot.remove(own)
-    options = {"fusestatic": "false", "strippath": "false", "discardvisual": "false"}
-    ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler", options)
-    try:
-        spec = mujoco.MjSpec.from_string(ET.tostring(robot, encoding="unicode"))
-    except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot read {name}: {_with_cure(error)}") from None
-    for mesh in spec.meshes:
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a mesh that is not closed has no volume
-    for geom in spec.geoms:
-        geom.mass = geom.contype = geom.conaffinity = 0
-    return spec
+    if isinstance(model, mujoco.MjSpec):
+        given: Any = model
+        return _without_lost_meshes(lambda: from_mujoco(given.copy, _SPECIFICATION, "copy"), _SPECIFICATION)
+    if isinstance(model, mujoco.MjModel):
+        raise ConfigurationError(
+            "a compiled model cannot be made elastic; give its file of MJCF (.xml) or URDF (.urdf), or its "
+            "mujoco.MjSpec"
+        )
+    if not isinstance(model, str | Path):
+        raise ConfigurationError(
+            "a model must be a file of MJCF (.xml) or URDF (.urdf), the text of one, a mujoco.MjSpec or a "
+            f"mujoco.MjModel, got {shown(model)}"
+        )
+    text = read_model_text(model)
+    require_bounds(text)
+    return _of_urdf(text, shapes) if text.is_urdf else _without_lost_meshes(lambda: _mjcf_spec(text), text.name)
+
+
+def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
+    """A specification compiled; `name` is what errors call it.
+
+    Raises:
+        ConfigurationError: MuJoCo cannot compile it, or what it compiles contradicts itself.
+    """
+    model = from_mujoco(spec.compile, name, "compile")
+    require_sound(model, name)
+    return model
+
+
+def require_sound(model: mujoco.MjModel, name: str) -> None:
+    """Refuse numbers that MuJoCo takes and that no robot has.
+
+    Raises:
+        ConfigurationError: A mass, an inertia or a property of a joint is not finite or negative, or a joint's lower
+            limit is above its upper one.
+    """
+    for what, values, element in (
+        ("mass", model.body_mass, model.body), ("inertia", model.body_inertia, model.body),
+        ("armature", model.dof_armature[model.jnt_dofadr], model.joint),
+        ("damping", model.dof_damping[model.jnt_dofadr], model.joint),
+        ("frictionloss", model.dof_frictionloss[model.jnt_dofadr], model.joint),
+        ("stiffness", model.jnt_stiffness, model.joint),
+    ):  # fmt: skip
+        sound = np.isfinite(values) & (np.asarray(values) >= 0.0)
+        wrong = np.flatnonzero(~(sound.all(axis=1) if sound.ndim > 1 else sound))
+        if wrong.size:
+            kind = "body" if element == model.body else "joint"
+            raise ConfigurationError(
+                f"{what} of {kind} {element(int(wrong[0])).name!r} of {name} must be finite and >= 0, "
+                f"got {shown(np.ravel(values[wrong[0]]).tolist())}"
+            )
+    if not np.isfinite(model.opt.gravity).all():
+        raise ConfigurationError(f"gravity of {name} must be finite [m/s²], got {shown(model.opt.gravity.tolist())}")
+    for j in range(model.njnt):
+        low, high = map(float, model.jnt_range[j])
+        if low > high or np.isnan(low + high):
+            raise ConfigurationError(
+                f"the limits of joint {model.joint(j).name!r} of {name} contradict themselves: {low:g} to {high:g}; "
+                "the lower limit must be below the upper one"
+            )
 
 
 def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
@@ -121,16 +175,178 @@ def keep_shapes(robot: ET.Element, folder: Path | None) -> list[str]:
     return lost
 
 
-def compiled_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
-    """A specification compiled; `name` is what errors call it.
+def urdf_spec(robot: ET.Element, name: str) -> mujoco.MjSpec:
+    """The specification of a URDF. Links that are fixed to others keep their names; shapes weigh and touch nothing.
+
+    Args:
+        robot: Root of the URDF with shapes that MuJoCo reads, see `keep_shapes`; it is changed.
+        name: What errors call it.
 
     Raises:
-        ConfigurationError: MuJoCo cannot compile it.
+        ConfigurationError: MuJoCo cannot read it.
+    """
+    own = robot.find("mujoco")
+    own = ET.SubElement(robot, "mujoco") if own is None else own
+    compilers = own.findall("compiler") or [ET.SubElement(own, "compiler")]
+    for compiler in compilers:
+        for key in _OF_FILES:
+            compiler.attrib.pop(key, None)
+        compiler.attrib.update(_URDF_OPTIONS)
+    text = ET.tostring(robot, encoding="unicode")
+    spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text), name, "read")
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a mesh that is not closed has no volume
+    for geom in spec.geoms:
+        geom.mass = geom.contype = geom.conaffinity = 0
+    return spec
+
+
+def _of_urdf(text: ModelText, shapes: bool) -> ReadModel:
+    """A URDF, judged without its shapes."""
+    _require_unique_names(text)
+    _require_tree(text)
+    bare = copy.deepcopy(text.root)
+    keep_shapes(bare, None)
+    spec = urdf_spec(bare, text.name)
+    model = compiled_spec(spec.copy(), text.name)
+    if not shapes:
+        return ReadModel(spec, model, text.name, [])
+    named = [mesh.get("filename", "") for mesh in text.root.iter("mesh")]
+    lost = keep_shapes(text.root, text.folder)
+    try:
+        drawn = urdf_spec(text.root, text.name)
+        return ReadModel(drawn, compiled_spec(drawn.copy(), text.name), text.name, lost)
+    except ConfigurationError:  # of a shape: without shapes it compiles
+        return ReadModel(spec, model, text.name, named or ["a shape"])
+
+
+def _require_unique_names(text: ModelText) -> None:
+    """Refuse a name that two links or two joints have: MuJoCo drops the second one."""
+    for kind in ("link", "joint"):
+        names = Counter(element.get("name", "") for element in text.root.findall(kind))
+        twice = [name for name, count in names.items() if count > 1 and name]
+        if twice:
+            raise ConfigurationError(
+                f"{text.name} has the {kind} {shown(twice[0])} {names[twice[0]]} times; give each {kind} its own name"
+            )
+
+
+def _require_tree(text: ModelText) -> None:
+    """Refuse links that are joined in a circle or twice, and joints of links that are not there."""
+    links = {link.get("name", "") for link in text.root.findall("link")}
+    parents: dict[str, str] = {}
+    for joint in text.root.findall("joint"):
+        name = shown(joint.get("name", ""))
+        ends = [element.get("link", "") if (element := joint.find(end)) is not None else "" for end in _ENDS]
+        for end, link in zip(_ENDS, ends, strict=True):
+            if link not in links:
+                raise ConfigurationError(
+                    f"joint {name} of {text.name} needs a {end} that is a link of it, got {shown(link)}"
+                )
+        if ends[1] in parents:
+            raise ConfigurationError(
+                f"link {shown(ends[1])} of {text.name} is the child of two joints; a URDF is a tree, cut the loop"
+            )
+        parents[ends[1]] = ends[0]
+    for link in parents:
+        seen: set[str] = set()
+        while link in parents and link not in seen:
+            seen.add(link)
+            link = parents[link]
+        if link in seen:
+            raise ConfigurationError(f"the links of {text.name} are joined in a circle at {shown(link)}; cut the loop")
+
+
+_ENDS = ("parent", "child")
+
+
+def _mjcf_spec(text: ModelText) -> mujoco.MjSpec:
+    """The specification of MJCF. A file that is not in UTF-8 goes to MuJoCo as a text."""
+    if text.file is not None and text.is_utf8:
+        file = str(text.file)
+        return from_mujoco(lambda: mujoco.MjSpec.from_file(file), text.name, "read")
+    spec = from_mujoco(lambda: mujoco.MjSpec.from_string(text.text), text.name, "read")
+    if text.file is not None:
+        spec.modelfiledir = str(text.folder)
+    return spec
+
+
+def _without_lost_meshes(read: Callable[[], mujoco.MjSpec], name: str) -> ReadModel:
+    """A specification that compiles: without its meshes and pictures, where these are why it does not.
+
+    What is compiled is read for that alone: a copy of a specification hides elements whose references are wrong.
     """
     try:
-        return spec.compile()
-    except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot compile {name}: {_with_cure(error)}") from None
+        model = compiled_spec(read(), name)
+        return ReadModel(read(), model, name, [])
+    except ConfigurationError as error:
+        problem = error
+    spec = read()
+    lost = [element.file or element.name for element in (*spec.meshes, *spec.textures)]
+    if not lost:
+        raise problem
+    heavy = _bodies_of_meshes(spec)
+    _take_meshes(spec)
+    if heavy:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+        for body in heavy:  # of any mass: would it compile if the meshes were there?
+            body.mass, body.inertia, body.explicitinertial = 1.0, np.ones(3), True
+    model = compiled_spec(spec.copy(), name)
+    if heavy:
+        raise ConfigurationError(
+            f"body {heavy[0].name!r} of {name} has its mass from a mesh that cannot be read; give the body an "
+            f"<inertial>, or bring the mesh. {problem}"
+        )
+    return ReadModel(spec, model, name, lost)
+
+
+def _bodies_of_meshes(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
+    """Bodies that have their mass from a mesh."""
+    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    return [
+        body
+        for body in spec.bodies[1:]
+        if any(_is_of_mesh(geom) for geom in body.geoms) and (from_geoms or not body.explicitinertial)
+    ]
+
+
+def _is_of_mesh(geom: mujoco.MjsGeom) -> bool:
+    """Whether a geom is a mesh, or a primitive that is fitted to one."""
+    return geom.type == _MESH or bool(geom.meshname)
+
+
+def _take_meshes(spec: mujoco.MjSpec) -> None:
+    for geom in [geom for geom in spec.geoms if _is_of_mesh(geom)]:
+        spec.delete(geom)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for element in [*spec.skins, *spec.meshes, *spec.textures]:
+        spec.delete(element)
+
+
+def from_mujoco(action: Callable[[], Result], name: str, verb: str) -> Result:
+    """What MuJoCo makes, in a thread of its own so that Ctrl-C reaches this one; its errors in words that teach."""
+    results: list[Result] = []
+    errors: list[Exception] = []
+
+    def work() -> None:
+        try:
+            results.append(action())
+        except Exception as error:  # MuJoCo raises nearly every kind, and "unknown exception"
+            errors.append(error)
+
+    thread = threading.Thread(target=work, daemon=True)
+    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_file = False  # no MUJOCO_LOG.TXT in the folder of a user
+    silent.set()
+    try:
+        thread.start()
+        thread.join()
+    finally:
+        before.set()
+    if errors:
+        raise ConfigurationError(f"MuJoCo cannot {verb} {name}: {_with_cure(errors[0])}") from None
+    return results[0]
 
 
 def _drawn(link: ET.Element, folder: Path) -> tuple[list[ET.Element], list[str]]:
@@ -154,10 +370,20 @@ def _mesh_file(name: str, folder: Path) -> Path | None:
         return None
     relative = name.removeprefix(_PACKAGE).removeprefix("file://")
     bases = [folder, *folder.resolve().parents] if name.startswith(_PACKAGE) else [folder]
-    return next((base / relative for base in bases if (base / relative).is_file()), None)
+    return next((base / relative for base in bases if _is_mesh(base / relative)), None)
 
 
-def _with_cure(error: ValueError) -> str:
+def _is_mesh(path: Path) -> bool:
+    try:
+        return path.is_file() and path.stat().st_size <= LARGEST_BYTES
+    except (OSError, ValueError):
+        return False
+
+
+def _with_cure(error: Exception) -> str:
     """MuJoCo's error in one line, and what to do about it where that is known."""
-    text = ", ".join(line.strip() for line in str(error).splitlines() if line.strip())
-    return "; ".join([text, *(cure for part, cure in _CURES.items() if part in text)])
+    text = ", ".join(line.strip() for line in str(error).splitlines() if line.strip()) or type(error).__name__
+    cures = [cure for part, cure in _CURES.items() if part in text]
+    if len(text) > _LONGEST_ERROR:
+        text = f"{text[:_LONGEST_ERROR]}..."
+    return "; ".join([text, *cures])

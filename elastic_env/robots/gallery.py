@@ -22,7 +22,8 @@ from elastic_env.core.errors import missing_extra, require_known
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
-from elastic_env.joint.model_file import keep_shapes, urdf_spec, xml_of
+from elastic_env.joint.known_torque import hinges_of
+from elastic_env.joint.model_file import read_model
 
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""
@@ -142,12 +143,8 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
         ConfigurationError: No such robot, or the package is missing.
     """
     path = gallery_file(name, folder)
-    if path.suffix == ".urdf":
-        root = xml_of(path)
-        keep_shapes(root, path.parent if shapes else None)
-        spec = urdf_spec(root, str(path))
-    else:
-        spec = mujoco.MjSpec.from_file(str(path))
+    spec = read_model(path, shapes=shapes).spec
+    if path.suffix != ".urdf":
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
     spec.option.timestep, spec.option.integrator = TIMESTEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -163,11 +160,6 @@ def gallery_robot(name: str, folder: Path | None = None, shapes: bool = False) -
     return spec
 
 
-def hinge_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the hinges of a model, in its order."""
-    return [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-
-
 def home_pose(name: str, joints: Sequence[str]) -> Array:
     """Pose about which a robot of the gallery moves, (n,) [rad]."""
     return np.array([GALLERY[name].home.get(joint, 0.0) for joint in joints])
@@ -175,7 +167,7 @@ def home_pose(name: str, joints: Sequence[str]) -> Array:
 
 def random_poses(model: mujoco.MjModel, generator: np.random.Generator, number: int = _POSES) -> Array:
     """Poses within the inner part of the joints' ranges, (number, n) [rad]; they may cross the robot itself."""
-    ids = [int(model.joint(name).id) for name in hinge_names(model)]
+    ids = [int(model.joint(name).id) for name in hinges_of(model)]
     limited = model.jnt_limited[ids, None].astype(bool)
     ends = np.clip(np.where(limited, model.jnt_range[ids], [-_FARTHEST, _FARTHEST]), -_FARTHEST, _FARTHEST)
     # of a range that lies beyond a half turn, such as Kinova's 47° to 313°, what is within it
@@ -207,7 +199,7 @@ def assumed_joints(model: mujoco.MjModel) -> dict[str, ElasticJoint]:
     Returns:
         Joints by name, with a servo that holds its angle.
     """
-    names = hinge_names(model)
+    names = hinges_of(model)
     poses = random_poses(model, np.random.default_rng(0))
     torque = np.abs(TreeTorque(model, names).gravity_torque(poses)).max(axis=0)
     inertia = np.array([_inertia(model, pose) for pose in poses])

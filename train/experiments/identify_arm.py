@@ -26,10 +26,11 @@ from baselines.identification.pose_plan import (
     plan_further,
     plan_poses,
 )
-from baselines.identification.static_arm import StaticArm, hinges_of
+from baselines.identification.static_arm import StaticArm
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
-from elastic_env.core.errors import unknown_name
-from elastic_env.joint.model_file import compiled_model
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.joint.known_torque import commanded_hinges, hinges_of
+from elastic_env.joint.model_file import compiled_model, from_mujoco
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
 from train.runs.folders import run_folder
@@ -193,11 +194,12 @@ def _candidates(config: IdentifyArmConfig, setting: _Setting, console: Console) 
 
 def shaped_model(path: str) -> mujoco.MjModel:
     """The model with its collision shapes; that of `compiled_model` where MuJoCo cannot read the shapes."""
+    plain = compiled_model(path)
     try:
-        shaped = mujoco.MjSpec.from_file(path).compile()
-    except ValueError:
-        return compiled_model(path)
-    return shaped if set(hinges_of(compiled_model(path))) <= set(hinges_of(shaped)) else compiled_model(path)
+        shaped = from_mujoco(lambda: mujoco.MjSpec.from_file(path).compile(), "the shapes of the model", "read")
+    except ConfigurationError:
+        return plain
+    return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain
 
 
 def _setting(config: IdentifyArmConfig, model: mujoco.MjModel, console: Console) -> _Setting:
@@ -205,7 +207,8 @@ def _setting(config: IdentifyArmConfig, model: mujoco.MjModel, console: Console)
     hinges = hinges_of(model)
     ranges = {name: _range(model, name) for name in hinges}
     log = None if config.log is None else read_log(Path(config.log), ranges, config.measured_by)
-    arm = StaticArm(model, hinges if log is None else log.joints, config.end_effector, config.payload)
+    joints = commanded_hinges(model) if log is None else log.joints
+    arm = StaticArm(model, joints, config.end_effector, config.payload)
     arm.require_gravity()
     if log is None:
         log = empty_log(arm, config.measured_by or "end_effector")

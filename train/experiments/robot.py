@@ -21,6 +21,7 @@ from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read
 from elastic_env.core.errors import ConfigurationError, ElasticError, shown
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
+from elastic_env.joint.model_text import is_file, is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
 from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGED, SagViews
@@ -172,13 +173,15 @@ def robot_arguments(trial: RobotTrial) -> dict[str, Any]:
 def _of_model(name: str) -> dict[str, Any]:
     if name in GALLERY:
         return _of_gallery(name)
-    if name.endswith(ENDINGS) and Path(name).is_file():
-        return read_robot_file(name)
-    if not Path(name).is_file():
+    if is_text(name):
+        return {"model": name, "joints": {}}
+    if not is_file(name):
         raise ConfigurationError(
-            f"no model at {name}; give a file of MJCF (.xml) or URDF (.urdf), a file of a robot (.yaml), or a robot of "
-            f"the gallery: {', '.join(GALLERY)}"
+            f"no model at {name_of(name)}; give a file of MJCF (.xml) or URDF (.urdf), a file of a robot (.yaml), or a "
+            f"robot of the gallery: {', '.join(GALLERY)}"
         )
+    if name.endswith(ENDINGS):
+        return read_robot_file(name)
     return {"model": str(Path(name).resolve()), "joints": {}}
 
 
@@ -227,8 +230,8 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
         The robot's file, for `--env`.
     """
     written, model, joints = dict(arguments), arguments["model"], arguments["joints"]
-    if model.lstrip().startswith("<"):
-        (folder / "model.xml").write_text(model, encoding="utf-8")
+    if is_text(model):
+        (folder / "model.xml").write_text(without_declaration(model), encoding="utf-8")
         written["model"] = "model.xml"
     else:
         written["model"] = str(Path(model).resolve())

@@ -27,13 +27,19 @@ class Tree:
     R: Array
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, float], gravcomp: bool) -> Self:
+    def of(
+        cls,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        held: Mapping[str, float] | Mapping[int, float],
+        gravcomp: bool,
+    ) -> Self:
         """Of a model whose other joints are held.
 
         Args:
             model: Compiled rigid model.
             joints: Hinges that move, in the order of the last axis of arrays.
-            held: Position of every other joint, a hinge [rad] or a slide [m].
+            held: Position of every other joint by name or number, a hinge [rad] or a slide [m].
             gravcomp: Whether `gravcomp` of the bodies takes from their weight.
         """
         data = mujoco.MjData(model)

@@ -19,13 +19,18 @@ class TreeTorque:
     Args:
         model: Compiled rigid model on a fixed base.
         joints: Hinges of the model, in the order of the last axis.
-        held: Position of every other joint, a hinge [rad] or a slide [m].
+        held: Position of every other joint by name or number, a hinge [rad] or a slide [m].
 
     Raises:
         ConfigurationError: A joint is no hinge, does not exist, or is left out.
     """
 
-    def __init__(self, model: mujoco.MjModel, joints: Sequence[str], held: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        held: Mapping[str, float] | Mapping[int, float] | None = None,
+    ) -> None:
         self._body = RigidBody(model, joints, held, gravcomp=True)
         at = [int(model.joint(name).id) for name in joints]
         self._spring = model.jnt_stiffness[at].copy()

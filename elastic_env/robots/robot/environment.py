@@ -10,18 +10,26 @@ from typing import Any, Literal
 
 import mujoco
 
+from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.dynamics.tree.end_effector import outermost_body
-from elastic_env.joint.frozen import frozen, require_fixed_base
-from elastic_env.joint.joint_settings import GivenJoints
-from elastic_env.joint.model_file import compiled_spec
+from elastic_env.joint.frozen import frozen
+from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
+from elastic_env.joint.known_torque import (
+    has_nameless_hinge,
+    hinges_of,
+    nameless_hinge,
+    require_fixed_base,
+    without_fingers,
+)
+from elastic_env.joint.model_file import GivenModel, compiled_spec
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot
 from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
 from elastic_env.robots.robot import ID, NAME
 from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, home_of_joints
-from elastic_env.robots.robot.model import GivenModel, RigidModel, read_robot
+from elastic_env.robots.robot.model import RigidModel, read_robot
 from elastic_env.runtime.joint_config import RewardWeights
 from elastic_env.runtime.joint_task import JointTask, stiffest
 from elastic_env.runtime.scenario import Scenario
@@ -99,11 +107,10 @@ def joint_robot(model: GivenModel, joints: GivenJoints, end_effector: str | None
     spec = read_robot(model)
     whole = compiled_spec(spec, "the model")
     require_fixed_base(whole)
-    hinges = [whole.joint(j).name for j in range(whole.njnt) if whole.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    others = [whole.joint(j).name for j in range(whole.njnt) if whole.joint(j).name not in hinges]
-    settings = elastic_settings(joints, hinges, others)
+    settings = _elastic_hinges(whole, joints)
+    names = list(settings)
     moving = frozen(spec, settings)
-    names, rigid = list(settings), moving.copy().compile()
+    rigid = compiled_spec(moving.copy(), "the model with held joints")
     mass = float(rigid.body_subtreemass[0])
     elastic = elastic_joints(moving, settings, LOAD_SHARE * mass)
     if len({joint.encoder_counts_per_turn for joint in elastic.values()}) > 1:
@@ -112,6 +119,20 @@ def joint_robot(model: GivenModel, joints: GivenJoints, end_effector: str | None
         NAME, RigidModel(model, tuple(names)), elastic, home=home_of_joints(whole, names).tolist(),
         end_effector=end_effector or outermost_body(rigid), load_kg=mass,
     )  # fmt: skip
+
+
+def _elastic_hinges(model: mujoco.MjModel, joints: GivenJoints) -> dict[str, JointSettings]:
+    """Settings of the elastic hinges: of those that a pattern fits all but coupled fingers."""
+    hinges = hinges_of(model)
+    if has_nameless_hinge(model) and not hinges:
+        raise nameless_hinge()
+    given = joints if isinstance(joints, Mapping) else read_mapping(Path(joints))
+    others = [name for j in range(model.njnt) if (name := model.joint(j).name) not in hinges]
+    settings = elastic_settings(given, hinges, others)
+    key_of_nameless = key_of(given, "")
+    if has_nameless_hinge(model) and key_of_nameless is not None and given[key_of_nameless] != HELD:
+        raise nameless_hinge()
+    return {name: settings[name] for name in without_fingers(model, settings, given)}
 
 
 def _home(robot: JointRobot, given: Mapping[str, float] | Sequence[float] | None) -> Sequence[float] | None:

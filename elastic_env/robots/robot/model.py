@@ -1,26 +1,19 @@
 """The rigid model of a robot from a file of MJCF or URDF, with bodies that can be drawn."""
 
 import warnings
-import xml.etree.ElementTree as ET
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import shown
 from elastic_env.joint.frozen import frozen
-from elastic_env.joint.model_file import compiled_spec, keep_shapes, mjcf_spec, urdf_spec, xml_of
+from elastic_env.joint.model_file import GivenModel, compiled_spec, read_model
 from elastic_env.rendering.simple_bodies import add_simple_bodies
-
-GivenModel = str | Path | mujoco.MjSpec
-"""A file of MJCF (.xml) or URDF (.urdf), the text of one, or a specification of MuJoCo."""
-
-_MESH = mujoco.mjtGeom.mjGEOM_MESH
 
 
 def read_robot(model: GivenModel) -> mujoco.MjSpec:
-    """The specification of a robot, which compiles.
+    """The specification of a robot, which compiles, see `read_model`.
 
     Collision shapes of a URDF are left out. What has a mesh that is missing, or that MuJoCo cannot read, is drawn by
     rods between the joints.
@@ -34,25 +27,15 @@ def read_robot(model: GivenModel) -> mujoco.MjSpec:
     Warns:
         UserWarning: Meshes are replaced.
     """
-    if isinstance(model, mujoco.MjSpec):
-        return _drawable(_copied(model), "the specification")
-    if not isinstance(model, str | Path):
-        raise ConfigurationError(
-            f"model must be a file of MJCF (.xml) or URDF (.urdf), its text or a mujoco.MjSpec, got {shown(model)}"
+    read = read_model(model, shapes=True)
+    if read.lost:
+        warnings.warn(
+            f"{len(read.lost)} meshes of {read.name} are missing or in a format that MuJoCo cannot read, such as "
+            f"{shown(read.lost[0])[1:-1]}; rods between the joints are drawn in their place",
+            stacklevel=4,
         )
-    if isinstance(model, str) and model.lstrip().startswith("<"):
-        root, name, folder = _parsed(model), "the text of the model", Path.cwd()
-    else:
-        root, name, folder = xml_of(Path(model)), str(model), Path(model).resolve().parent
-    if root.tag == "robot":
-        return _of_urdf(root, name, folder)
-    if name == str(model):
-        return _drawable(mjcf_spec(Path(model)), name)
-    try:
-        spec = mujoco.MjSpec.from_string(str(model))
-    except ValueError as error:
-        raise ConfigurationError(f"MuJoCo cannot read {name}: {error}") from None
-    return _drawable(spec, name)
+        add_simple_bodies(read.spec)
+    return read.spec
 
 
 class RigidModel:
@@ -83,7 +66,7 @@ class RigidModel:
         given: Any = self._model
         if isinstance(given, mujoco.MjSpec):
             given = _copied(given)
-            given.compile()
+            compiled_spec(given, "the specification")
             given = given.to_xml()
         return {"_model": given, "_joints": self._joints, "_spec": None}
 
@@ -104,62 +87,3 @@ def _bare(spec: mujoco.MjSpec, joints: tuple[str, ...]) -> mujoco.MjSpec:
         hinge.damping = damping
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     return spec
-
-
-def _parsed(text: str) -> ET.Element:
-    try:
-        return ET.fromstring(text)
-    except ET.ParseError as error:
-        raise ConfigurationError(f"the text of the model is no XML: {error}; give MJCF or URDF") from None
-
-
-def _of_urdf(root: ET.Element, name: str, folder: Path) -> mujoco.MjSpec:
-    """A URDF with the meshes that can be read."""
-    lost = keep_shapes(root, folder)
-    spec = urdf_spec(root, name)
-    if lost:
-        _warn_of(name, lost)
-        add_simple_bodies(spec)
-    return _drawable(spec, name)
-
-
-def _drawable(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
-    """A specification that compiles: without its meshes, where these are why it does not."""
-    try:
-        spec.copy().compile()
-    except ValueError as error:
-        meshes = [mesh.file or mesh.name for mesh in spec.meshes]
-        if not meshes:
-            compiled_spec(spec, name)
-        _require_masses(spec, name, str(error))
-        _take_meshes(spec)
-        compiled_spec(spec, name)
-        _warn_of(name, meshes)
-        add_simple_bodies(spec)
-    return spec
-
-
-def _require_masses(spec: mujoco.MjSpec, name: str, problem: str) -> None:
-    """Refuse a model of which a mass would be lost with a mesh."""
-    from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    for body in spec.bodies[1:]:
-        if any(geom.type == _MESH for geom in body.geoms) and (from_geoms or not body.explicitinertial):
-            raise ConfigurationError(
-                f"body {body.name!r} of {name} has its mass from a mesh that cannot be read "
-                f"({problem.splitlines()[0]}); give the body an <inertial>, or bring the mesh"
-            )
-
-
-def _take_meshes(spec: mujoco.MjSpec) -> None:
-    for geom in [geom for geom in spec.geoms if geom.type == _MESH]:
-        spec.delete(geom)
-    for element in [*spec.skins, *spec.meshes]:
-        spec.delete(element)
-
-
-def _warn_of(name: str, meshes: list[str]) -> None:
-    warnings.warn(
-        f"{len(meshes)} meshes of {name} are missing or in a format that MuJoCo cannot read, such as {meshes[0]}; "
-        "rods between the joints are drawn in their place",
-        stacklevel=6,
-    )

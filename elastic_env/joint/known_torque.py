@@ -1,0 +1,360 @@
+"""The one judgement of what a compensator can know of a model: which joints move, and what else acts on them.
+
+Everything that a model has is either part of the torque at rest, held, or refused with its name.
+"""
+
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Sequence
+
+import mujoco
+import numpy as np
+
+from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.core.signals import Array
+from elastic_env.joint.model_file import require_sound
+
+MOST_ELASTIC = 80
+"""Joints that are commanded; whether the physics follows them takes a time that grows with their cube."""
+
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_WRAP_JOINT, _WRAP_SITE, _WRAP_SPHERE, _WRAP_CYLINDER = (
+    int(getattr(mujoco.mjtWrap, f"mjWRAP_{kind}")) for kind in ("JOINT", "SITE", "SPHERE", "CYLINDER")
+)
+_EQ_JOINT, _EQ_TENDON = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)
+_TENDON, _SITE, _SLIDERCRANK = (
+    int(getattr(mujoco.mjtTrn, f"mjTRN_{kind}")) for kind in ("TENDON", "SITE", "SLIDERCRANK")
+)
+_FLAGS = {
+    int(mujoco.mjtDisableBit.mjDSBL_GRAVITY): "gravity",
+    int(mujoco.mjtDisableBit.mjDSBL_SPRING): "spring",
+    int(mujoco.mjtDisableBit.mjDSBL_ACTUATION): "actuation",
+}
+"""Flags of <option> that take away what bends a joint, or what holds it."""
+_POSES = (0.0, 0.37, -0.83)
+"""Offsets from the home pose at which two joints about one axis would still have one axis [rad]."""
+_SINGULAR = 1e-10
+
+
+def hinges_of(model: mujoco.MjModel) -> list[str]:
+    """Names of the hinges of a model that have one, in its order."""
+    return [name for j in _hinges(model) if (name := model.joint(j).name)]
+
+
+def has_nameless_hinge(model: mujoco.MjModel) -> bool:
+    """Whether a hinge has no name, by which its stiffness could be given."""
+    return any(not model.joint(j).name for j in _hinges(model))
+
+
+def nameless_hinge() -> ConfigurationError:
+    """The error for a hinge without a name that is to be elastic."""
+    return ConfigurationError(
+        "a hinge of the model has no name; give each one, the stiffness is by name, or name the joints that are "
+        "elastic: the others are held"
+    )
+
+
+def commanded_hinges(model: mujoco.MjModel, named: Collection[str] = ()) -> list[str]:
+    """Hinges that are commanded where nobody says which: all but fingers that the model couples.
+
+    Args:
+        model: Compiled rigid model.
+        named: Joints that somebody names, which are commanded in any case.
+
+    Raises:
+        ConfigurationError: There is no hinge, or one has no name.
+
+    Warns:
+        UserWarning: Fingers are held.
+    """
+    names = hinges_of(model)
+    if has_nameless_hinge(model):
+        raise nameless_hinge()
+    if not names:
+        raise ConfigurationError(
+            "the model has no hinge, and elastic joints are hinges; give a robot with rotary joints"
+        )
+    return without_fingers(model, names, named)
+
+
+def without_fingers(model: mujoco.MjModel, joints: Iterable[str], named: Collection[str]) -> list[str]:
+    """The joints without the fingers that the model couples and that nobody names; arguments as `commanded_hinges`."""
+    joints = list(joints)
+    fingers = [name for name in coupled_fingers(model) if name in joints and name not in named]
+    if fingers:
+        warnings.warn(
+            f"{_listed(fingers)} are coupled in the model (mimic), and are held; the other joints are elastic",
+            stacklevel=5,
+        )
+    return [name for name in joints if name not in fingers]
+
+
+def coupled_fingers(model: mujoco.MjModel) -> list[str]:
+    """Hinges of grippers whose fingers follow one another: joints that equalities couple, side by side at the end.
+
+    Two fingers are on different branches, and carry no other joint. Coupled joints within the arm are none.
+    """
+    groups: list[set[int]] = []
+    for e in _active(model):
+        if model.eq_type[e] == _EQ_JOINT and model.eq_obj2id[e] >= 0:
+            pair = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])}
+            joined = [group for group in groups if group & pair]
+            groups = [group for group in groups if not group & pair] + [pair.union(*joined)]
+    fingers = [j for group in groups if _is_gripper(model, group) for j in group]
+    return [model.joint(j).name for j in _hinges(model) if j in fingers and model.joint(j).name]
+
+
+def home_of(model: mujoco.MjModel) -> Array:
+    """Positions of the joints in the first keyframe, or the model's reference, (nq,) [rad], [m]."""
+    return model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
+
+
+def require_fixed_base(model: mujoco.MjModel) -> None:
+    """Refuse a robot that floats.
+
+    Raises:
+        ConfigurationError: A joint is free or a ball joint.
+    """
+    for j in range(model.njnt):
+        if model.jnt_type[j] not in (_HINGE, _SLIDE):
+            raise ConfigurationError(
+                f"joint {model.joint(j).name!r} is free or a ball joint; a fixed base, hinges and slides are needed: "
+                "the torque of a floating robot depends on its contacts"
+            )
+
+
+def require_few(joints: Collection[str]) -> None:
+    """Refuse more elastic joints than can be simulated.
+
+    Raises:
+        ConfigurationError: There are more than `MOST_ELASTIC`.
+    """
+    if len(joints) > MOST_ELASTIC:
+        raise ConfigurationError(
+            f"at most {MOST_ELASTIC} joints can be elastic, got {len(joints)}; name those that matter"
+        )
+
+
+def require_known_torque(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+    """Refuse a model in which something acts on the commanded joints that is not known in advance.
+
+    Args:
+        model: Compiled rigid model.
+        joints: Hinges that are commanded; all others are held.
+
+    Raises:
+        ConfigurationError: A joint does not exist, is no hinge or is named twice; the base floats; or a constraint, a
+            tendon, a drive that is not on a joint, a deformable body, a plugin, wind or a flag acts on the joints.
+    """
+    require_sound(model, "the model")
+    require_fixed_base(model)
+    ids = _ids_of(model, joints)
+    _require_flags(model)
+    for e in _active(model):
+        acts = _acted_on(model, e)
+        if acts & ids:
+            raise ConfigurationError(
+                f"the model has an equality constraint of {_ends_of(model, e)}, whose torque is not known in advance; "
+                f"take it out of the model{_or_hold(model, acts & ids, ids)}"
+            )
+    for t in range(model.ntendon):
+        if _pulls(model, t) and (acts := _joints_of_tendon(model, t) & ids):
+            raise ConfigurationError(
+                f"the model's tendon {model.tendon(t).name!r} has stiffness, damping, friction or inertia; the torque "
+                f"of tendons with stiffness is not compensated; take it out of the model{_or_hold(model, acts, ids)}"
+            )
+    for a in range(model.nu):
+        if acts := _driven_beside_joints(model, a) & ids:
+            raise ConfigurationError(
+                f"the model's actuator {model.actuator(a).name!r} drives {_names(model, acts)} by "
+                f"{_TRANSMISSIONS[int(model.actuator_trntype[a])]}, which is not compensated; drive each joint by an "
+                f"actuator of its own, or take this one out of the model{_or_hold(model, acts, ids)}"
+            )
+    for j in np.flatnonzero(model.jnt_stiffnesspoly.any(axis=-1)):
+        if int(j) in ids:
+            raise ConfigurationError(
+                f"joint {model.joint(int(j)).name!r} has a spring whose torque is not linear, which is not "
+                "compensated; give it one number"
+            )
+    _require_inertia(model, joints)
+
+
+_TRANSMISSIONS = {_TENDON: "a tendon", _SITE: "a site", _SLIDERCRANK: "a slider-crank"}
+
+
+def _hinges(model: mujoco.MjModel) -> list[int]:
+    return [j for j in range(model.njnt) if model.jnt_type[j] == _HINGE]
+
+
+def _ids_of(model: mujoco.MjModel, joints: Sequence[str]) -> set[int]:
+    known = {name: j for j in range(model.njnt) if (name := model.joint(j).name)}
+    require_known("joint", joints, known)
+    if len(set(joints)) != len(joints) or not joints:
+        raise ConfigurationError(f"joints must name at least one joint, and each once, got {shown(list(joints))}")
+    require_few(joints)
+    for name in joints:
+        if model.jnt_type[known[name]] != _HINGE:
+            raise ConfigurationError(f"joint {name!r} of the rigid model is no hinge; elastic joints are hinges")
+    return {known[name] for name in joints}
+
+
+def _require_flags(model: mujoco.MjModel) -> None:
+    for bit, flag in _FLAGS.items():
+        if int(model.opt.disableflags) & bit:
+            raise ConfigurationError(
+                f'the model has <flag {flag}="disable"/> in <option>, with which its joints do not bend as they do on '
+                "a robot; take the flag out" + ("; for no gravity write gravity='0 0 0'" if flag == "gravity" else "")
+            )
+    if model.nflex:
+        raise ConfigurationError(
+            "the model has a deformable body (flex), whose forces on the links are not known in advance; take it out"
+        )
+    if (model.body_plugin >= 0).any() or (model.actuator_plugin >= 0).any():
+        raise ConfigurationError(
+            "the model has a plugin of a body or an actuator, whose forces are not known in advance; take it out"
+        )
+    if model.opt.wind.any() and (model.opt.density > 0.0 or model.opt.viscosity > 0.0):
+        raise ConfigurationError(
+            "the model has wind, whose force on the links is not compensated; take `wind` out of <option>"
+        )
+
+
+def _active(model: mujoco.MjModel) -> Iterator[int]:
+    """Equality constraints that act from the start."""
+    if not int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_EQUALITY):
+        yield from (e for e in range(model.neq) if model.eq_active0[e])
+
+
+def _acted_on(model: mujoco.MjModel, equality: int) -> set[int]:
+    """Joints that feel an equality constraint."""
+    kind = int(model.eq_type[equality])
+    ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
+    if kind == _EQ_JOINT:
+        return set(ends)
+    if kind == _EQ_TENDON:
+        return set().union(*(_joints_of_tendon(model, t) for t in ends))
+    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        return _between(model, [int(model.site_bodyid[site]) for site in ends])
+    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_BODY:
+        return _between(model, [*ends, 0][:2])
+    return set(range(model.njnt))
+
+
+def _ends_of(model: mujoco.MjModel, equality: int) -> str:
+    kind, of = int(model.eq_type[equality]), model.eq_objtype[equality]
+    read = model.joint if kind == _EQ_JOINT else model.tendon if kind == _EQ_TENDON else model.body
+    if of == mujoco.mjtObj.mjOBJ_SITE:
+        read = model.site
+    elif kind not in (_EQ_JOINT, _EQ_TENDON) and of != mujoco.mjtObj.mjOBJ_BODY:
+        return "a deformable body"
+    ends = [int(i) for i in (model.eq_obj1id[equality], model.eq_obj2id[equality]) if i >= 0]
+    return " and ".join(shown(read(i).name)[1:-1] or f"number {i}" for i in ends)
+
+
+def _chain(model: mujoco.MjModel, body: int) -> set[int]:
+    """Joints between a body and the world."""
+    joints: set[int] = set()
+    while body > 0:
+        first = int(model.body_jntadr[body])
+        joints.update(range(first, first + int(model.body_jntnum[body])))
+        body = int(model.body_parentid[body])
+    return joints
+
+
+def _between(model: mujoco.MjModel, bodies: Sequence[int]) -> set[int]:
+    """Joints that move bodies against one another."""
+    chains = [_chain(model, body) for body in bodies]
+    return set().union(*(chain ^ chains[0] for chain in chains))
+
+
+def _joints_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+    """Joints with which the length of a tendon changes."""
+    joints: set[int] = set()
+    bodies: list[int] = []
+    of_body = {_WRAP_SITE: model.site_bodyid, _WRAP_SPHERE: model.geom_bodyid, _WRAP_CYLINDER: model.geom_bodyid}
+    for at in range(int(model.tendon_adr[tendon]), int(model.tendon_adr[tendon] + model.tendon_num[tendon])):
+        kind, one = int(model.wrap_type[at]), int(model.wrap_objid[at])
+        if kind == _WRAP_JOINT:
+            joints.add(one)
+        elif kind in of_body:
+            bodies.append(int(of_body[kind][one]))
+    return joints | _between(model, bodies)
+
+
+def _pulls(model: mujoco.MjModel, tendon: int) -> bool:
+    own = (
+        model.tendon_stiffness, model.tendon_stiffnesspoly, model.tendon_damping, model.tendon_frictionloss,
+        model.tendon_armature,
+    )  # fmt: skip
+    return any(np.any(values[tendon]) for values in own)
+
+
+def _driven_beside_joints(model: mujoco.MjModel, actuator: int) -> set[int]:
+    """Joints that an actuator moves without being on one of them."""
+    kind = int(model.actuator_trntype[actuator])
+    first, second = (int(i) for i in model.actuator_trnid[actuator])
+    if kind == _TENDON:
+        return _joints_of_tendon(model, first)
+    if kind in (_SITE, _SLIDERCRANK):
+        return _between(model, [int(model.site_bodyid[site]) if site >= 0 else 0 for site in (first, second)])
+    return set()
+
+
+def _or_hold(model: mujoco.MjModel, acts: set[int], moving: set[int]) -> str:
+    """How to hold the joints that something acts on, where others are left."""
+    if acts == moving:
+        return ""
+    names = [model.joint(j).name for j in sorted(acts)]
+    lines = ", ".join(f"'{name}: held'" for name in names[:8])
+    more = ", ..." if len(names) > 8 else ""
+    return (
+        f", or hold the joints on which it acts: in the file of joints (`joints`, --stiffness joints.yaml) write "
+        f"'\"*\": K', {lines}{more}; PositionCompensator takes `joints` without them"
+    )
+
+
+def _names(model: mujoco.MjModel, joints: set[int]) -> str:
+    return _listed([model.joint(j).name for j in sorted(joints)])
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+
+
+def _is_gripper(model: mujoco.MjModel, group: set[int]) -> bool:
+    """Whether coupled joints are fingers: on two branches at least, and with no other joint beyond them."""
+    bodies = {int(model.jnt_bodyid[j]) for j in group}
+    carried = {j for j in range(model.njnt) if _chain(model, int(model.jnt_bodyid[j])) & group}
+    first = [body for body in bodies if not _chain(model, int(model.body_parentid[body])) & group]
+    return carried <= group and len(first) > 1 and len(group) < model.njnt
+
+
+def _require_inertia(model: mujoco.MjModel, joints: Sequence[str]) -> None:
+    """Refuse joints that move no inertia of their own, such as two about one axis."""
+    data = mujoco.MjData(model)
+    at = [int(model.joint(name).id) for name in joints]
+    dofs = model.jnt_dofadr[at]
+    full = np.zeros((model.nv, model.nv))
+    smallest = []
+    for offset in _POSES:
+        data.qpos[:] = home_of(model)
+        data.qpos[model.jnt_qposadr[at]] += offset
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_crb(model, data)
+        mujoco.mj_fullM(model, data, full)
+        links = full[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs])
+        scale = np.sqrt(np.maximum(np.diag(links), np.finfo(np.float64).tiny))
+        scaled = links / np.outer(scale, scale)
+        if not np.isfinite(scaled).all():
+            raise ConfigurationError(
+                "the masses and inertias of the model are too large to compute with; see their units"
+            )
+        values, vectors = np.linalg.eigh(scaled)
+        smallest.append((values[0], vectors[:, 0]))
+    value, vector = max(smallest, key=lambda pair: pair[0])
+    if value < _SINGULAR:
+        names = " and ".join(joints[int(i)] for i in np.argsort(-np.abs(vector))[:2])
+        raise ConfigurationError(
+            f"the links that {names} move have no inertia of their own, or two joints have one axis; give each link "
+            "between two joints its mass and inertia, and each joint its own axis"
+        )

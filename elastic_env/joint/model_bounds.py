@@ -1,0 +1,266 @@
+"""Bounds of a model, counted on its XML before MuJoCo builds it: a small file must not ask for much time or memory."""
+
+import math
+import stat
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.joint.model_text import DEEPEST, LARGEST_BYTES, ModelText, decoded, name_of, parse_xml, read_bytes
+
+MOST_JOINTS = 500
+MOST_BODIES = 2_000
+MOST_ELEMENTS = 20_000
+"""Elements of a model, each with as many copies as <replicate> and <attach> make of it."""
+MOST_PIXELS = 2**28
+"""Of all pictures of a model together."""
+MOST_ASSET_BYTES = 500_000_000
+"""Of all meshes and pictures of a model together."""
+
+_JOINTS = ("joint", "freejoint")
+_WORLD = ("worldbody", "body")
+_SOFT = ("flexcomp", "composite", "flex")
+_LARGEST = (
+    (("hfield",), ("nrow", "ncol"), 4_000_000),
+    (("texture",), ("width",), 4_096),
+    (("texture",), ("height",), 24_576),
+    (("numeric",), ("size",), 10_000),
+    (("camera",), ("resolution",), 16_000_000),
+    (("size",), ("nuserdata",), 1_000_000),
+    (("size",), ("nkey",), 10_000),
+    (("size",), ("nconmax",), 1_000_000),
+    (("size",), ("njmax",), 1_000_000),
+    (("size",), ("nstack",), 100_000_000),
+    (("global",), ("offwidth",), 16_384),
+    (("global",), ("offheight",), 16_384),
+    (("quality",), ("shadowsize",), 16_384),
+    (("quality",), ("offsamples",), 64),
+    (("quality",), ("numslices", "numstacks"), 10_000),
+    (("quality",), ("numquads",), 100),
+    (("lengthrange",), ("inttotal",), 100),
+    (("user",), ("dim",), 10_000),
+    (None, ("nsample",), 1_000),
+    (None, ("actdim",), 100),
+)
+"""Tags (None for all), attributes whose numbers are multiplied, and the largest product of their magnitudes."""
+_PREFIXES = ("nuser_", "iterations", "_iterations", "_initpoints")
+_MOST_OF_OTHERS = 10_000
+_UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
+_MOST_MEMORY = 2**30
+_FINEST = 300
+"""Resolution of a mesh that MuJoCo makes; it has as many vertices squared."""
+_SHORTEST_STEP_S = 1e-5
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def require_bounds(model: ModelText) -> None:
+    """Refuse a model that is larger than any robot.
+
+    Raises:
+        ConfigurationError: A count, a size or a file is beyond its bound, or files include one another in a circle.
+    """
+    counts = _Counts(model)
+    if model.is_urdf:
+        counts.add_urdf(model.root)
+    else:
+        counts.add(model.root, (() if model.file is None else (model.file.resolve(),)))
+
+
+@dataclass
+class _Counts:
+    """What a model has, so far."""
+
+    model: ModelText
+    elements: float = 0.0
+    bodies: float = 0.0
+    joints: float = 0.0
+    pixels: float = 0.0
+    asset_bytes: int = 0
+    _assets: set[Path] = field(default_factory=set)
+    _attached: dict[str, ET.Element] = field(default_factory=dict)
+    _folders: list[str] = field(default_factory=lambda: [""])
+
+    def add_urdf(self, robot: ET.Element) -> None:
+        """Count a URDF, whose links nest in MuJoCo as they are joined."""
+        self._bound("elements", sum(1 for _ in robot.iter()), MOST_ELEMENTS)
+        self._bound("bodies", len(robot.findall("link")), MOST_BODIES)
+        self._bound("joints", sum(joint.get("type") != "fixed" for joint in robot.findall("joint")), MOST_JOINTS)
+        for element in robot.iter():
+            self._require_numbers(element)
+        for mesh in robot.iter("mesh"):
+            self._add_asset(mesh.get("filename", "").removeprefix("file://"))
+
+    def add(self, root: ET.Element, files: tuple[Path, ...]) -> None:
+        """Count a document of MJCF; `files` are those in which it is included."""
+        for compiler in root.iter("compiler"):
+            self._folders += [compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")]
+        self._walk(root, files, 1.0, in_world=False, depth=len(files))
+
+    def _walk(self, element: ET.Element, files: tuple[Path, ...], copies: float, in_world: bool, depth: int) -> None:
+        tag = element.tag
+        if depth > DEEPEST:
+            raise ConfigurationError(f"{self.model.name} must be nested at most {DEEPEST} elements deep, with includes")
+        if tag in _SOFT:
+            raise ConfigurationError(
+                f"{self.model.name} has a deformable body (<{tag}>), whose forces on the links are not known in "
+                "advance; take it out of the model"
+            )
+        if tag == "replicate":
+            copies *= max(_number(element.get("count", "1")), 1.0)
+        in_world = in_world or tag in _WORLD
+        self.elements += copies
+        self._bound("elements", self.elements, MOST_ELEMENTS)
+        if tag == "body":
+            self.bodies += copies
+            self._bound("bodies", self.bodies, MOST_BODIES)
+        if in_world and tag in _JOINTS:
+            self.joints += copies
+            self._bound("joints", self.joints, MOST_JOINTS)
+        self._require_numbers(element)
+        if tag == "include":
+            self._include(element.get("file", ""), files, copies, in_world, depth)
+        elif tag == "model":
+            self._attachable(element, files)
+        elif tag == "attach":
+            self._attach(element, files, copies, depth)
+        else:
+            for key in element.keys() if tag in ("mesh", "texture", "hfield", "skin") else ():
+                if key.startswith("file"):
+                    self._add_asset(element.get(key, ""))
+        for part in element:
+            self._walk(part, files, copies, in_world, depth + 1)
+
+    def _include(self, name: str, files: tuple[Path, ...], copies: float, in_world: bool, depth: int) -> None:
+        root, path = self._document(name, files)
+        if root is not None:
+            for compiler in root.iter("compiler"):
+                self._folders += [compiler.get(key, "") for key in ("meshdir", "texturedir", "assetdir")]
+            for part in root:
+                self._walk(part, (*files, path), copies, in_world, depth + 1)
+
+    def _attachable(self, element: ET.Element, files: tuple[Path, ...]) -> None:
+        name = element.get("file", "")
+        root, path = self._document(name, files)
+        if root is not None:
+            self._attached[element.get("name") or Path(name).stem] = root
+            self._walk(root, (*files, path), 1.0, in_world=False, depth=len(files) + 1)
+
+    def _attach(self, element: ET.Element, files: tuple[Path, ...], copies: float, depth: int) -> None:
+        root = self._attached.get(element.get("model", ""))
+        if root is not None:
+            bodies = [body for body in root.iter("body") if body.get("name") == element.get("body")]
+            for body in bodies or root.findall("worldbody"):
+                self._walk(body, files, copies, in_world=True, depth=depth + 1)
+
+    def _document(self, name: str, files: tuple[Path, ...]) -> tuple[ET.Element | None, Path]:
+        """A further file of the model; None where MuJoCo will say that it is missing."""
+        folders = [self.model.folder, *(file.parent for file in files[-1:])]
+        path = next((folder / name for folder in folders if _exists(folder / name)), None)
+        if path is None or not name:
+            return None, self.model.folder
+        path = path.resolve()
+        if path in files:
+            raise ConfigurationError(f"{self.model.name} includes {name_of(path)} within itself; take the circle out")
+        text, _ = decoded(read_bytes(path, "included model"), name_of(path))
+        return parse_xml(text, name_of(path)), path
+
+    def _add_asset(self, name: str) -> None:
+        """A mesh or picture, which has to be a regular file of bounded size; one that is missing is judged later."""
+        for folder in self._folders:
+            path = self.model.folder / folder / name
+            if not name or path in self._assets or not _exists(path):
+                continue
+            self._assets.add(path)
+            facts = path.stat()
+            if stat.S_ISDIR(facts.st_mode):
+                continue
+            if not stat.S_ISREG(facts.st_mode):
+                raise ConfigurationError(f"{self.model.name} names {name_of(path)}, which is no regular file")
+            self._bound(f"bytes of {name_of(name)}", facts.st_size, LARGEST_BYTES)
+            self.asset_bytes += facts.st_size
+            self._bound("bytes of meshes and pictures", self.asset_bytes, MOST_ASSET_BYTES)
+            self.pixels += _pixels(path)
+            self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
+
+    def _require_numbers(self, element: ET.Element) -> None:
+        tag, values = element.tag, element.attrib
+        for tags, names, most in _LARGEST:
+            if (tags is None or tag in tags) and any(name in values for name in names):
+                numbers = [number for name in names for number in _numbers(values.get(name, ""))]
+                self._bound(f"{' times '.join(names)} of <{tag}>", _product(numbers), most)
+        for name, value in values.items():
+            if name.startswith(_PREFIXES[:1]) or name.endswith(_PREFIXES[1:]):
+                self._bound(f"{name} of <{tag}>", _product(_numbers(value)), _MOST_OF_OTHERS)
+            if name != "name" and _has_nan(value):
+                raise ConfigurationError(f"{name} of <{tag}> in {self.model.name} must be numbers, got {shown(value)}")
+        if tag == "texture" and {"width", "height"} <= set(values):
+            self.pixels += _product([*_numbers(values["width"]), *_numbers(values["height"])])
+            self._bound("pixels of pictures", self.pixels, MOST_PIXELS)
+        if tag == "mesh" and "params" in values:
+            self._bound("as params of a mesh", max(_numbers(values["params"]), default=0.0), _FINEST)
+        if tag == "size" and "memory" in values:
+            self._bound("memory of <size> [bytes]", _bytes(values["memory"]), _MOST_MEMORY)
+        if tag == "lengthrange" and "timestep" in values:
+            step = _number(values["timestep"])
+            if not step >= _SHORTEST_STEP_S:
+                raise ConfigurationError(
+                    f"timestep of <lengthrange> in {self.model.name} must be at least {_SHORTEST_STEP_S:g} s, "
+                    f"got {step:g}"
+                )
+
+    def _bound(self, what: str, value: float, most: float) -> None:
+        if not value <= most:
+            raise ConfigurationError(
+                f"{self.model.name} must have at most {most:.15g} {what}, copies counted, it has {value:.15g} or more; "
+                "give a smaller model"
+            )
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def _number(text: str) -> float:
+    """A number of an attribute; 0 where it is none, which MuJoCo refuses."""
+    try:
+        value = float(text)
+    except ValueError:
+        return 0.0
+    return math.inf if math.isnan(value) else value
+
+
+def _numbers(text: str) -> list[float]:
+    return [abs(_number(part)) for part in text.split()[:100]]
+
+
+def _product(numbers: list[float]) -> float:
+    """Of the magnitudes; what is below one does not make a product smaller."""
+    return math.prod(max(number, 1.0) for number in numbers)
+
+
+def _has_nan(text: str) -> bool:
+    if "nan" not in text.lower():
+        return False
+    try:
+        return any(math.isnan(float(part)) for part in text.split())
+    except ValueError:
+        return False
+
+
+def _bytes(text: str) -> float:
+    """Bytes of a size such as "64M"."""
+    text = text.strip()
+    unit = _UNITS.get(text[-1:].upper(), 1)
+    return abs(_number(text[:-1] if unit > 1 else text)) * unit
+
+
+def _pixels(path: Path) -> int:
+    """Pixels that a PNG declares; 0 for other files."""
+    with path.open("rb") as file:
+        head = file.read(24)
+    is_png = head.startswith(_PNG) and len(head) == 24
+    return int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big") if is_png else 0

@@ -1,0 +1,236 @@
+"""The XML of a model, read within bounds before MuJoCo sees it: a file of MJCF or URDF, or the text of one.
+
+Prefixes that nobody declares are read as MuJoCo and ROS read them. What would have to be expanded first (xacro,
+entities) is refused.
+"""
+
+import codecs
+import re
+import stat
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from elastic_env.core.errors import ConfigurationError, shown
+
+LARGEST_BYTES = 50_000_000
+"""Of a model's file, and of its text."""
+DEEPEST = 200
+"""Elements within one another."""
+LONGEST_NAME = 200
+"""Characters of a name or path that an error prints."""
+
+_BLANK = "\ufeff \t\r\n"
+_KINDS = ("mujoco", "robot")
+_FILE = "give a file of MJCF (.xml) or URDF (.urdf)"
+_DECLARED = re.compile(rb"""^\s*<\?xml[^>]{0,200}?encoding\s*=\s*["']([A-Za-z0-9._-]{1,40})["']""")
+_DECLARATION = re.compile(r"^<\?xml[^>]*\?>")
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+_NOT_OF_FILES = {"idna", "punycode", "unicode_escape", "raw_unicode_escape", "undefined", "mbcs", "oem"}
+_XACRO = "xacro"
+_EXPAND = "expand it first: xacro arm.urdf.xacro > arm.urdf"
+_XACRO_PARTS = {"property", "macro", "include", "insert_block", "if", "unless", "arg"}
+"""Children of a robot that old files of xacro have without prefix."""
+_URDF_PARTS = {
+    "robot", "link", "joint", "origin", "mass", "inertia", "axis", "limit", "dynamics", "parent", "child", "mimic",
+    "box", "cylinder", "sphere", "mesh",
+}  # fmt: skip
+_PLACEHOLDER = re.compile(r"\$[{(]")
+
+
+@dataclass(frozen=True)
+class ModelText:
+    """A model as XML.
+
+    Attributes:
+        root: Its root, <mujoco> or <robot>. Prefixes are part of the tags.
+        name: What errors call it.
+        folder: Where files that it names are looked for.
+        file: Its file; None for a text.
+        text: The text itself, without mark and encoding.
+        is_utf8: Whether the file is in UTF-8, which MuJoCo reads by itself.
+    """
+
+    root: ET.Element
+    name: str
+    folder: Path
+    file: Path | None
+    text: str
+    is_utf8: bool
+
+    @property
+    def is_urdf(self) -> bool:
+        """Whether it is a URDF rather than MJCF."""
+        return self.root.tag == "robot"
+
+
+def read_model_text(model: str | Path) -> ModelText:
+    """A file of MJCF or URDF, or the text of one.
+
+    Raises:
+        ConfigurationError: There is no such file, it is too large, no XML or no model, or it has to be expanded first.
+    """
+    if is_text(model):
+        name, text = "the text of the model", str(model).lstrip(_BLANK)
+        if len(text) > LARGEST_BYTES:
+            raise ConfigurationError(f"{name} must have at most {LARGEST_BYTES} characters, it has {len(text)}")
+        found = ModelText(parse_xml(text, name), name, Path.cwd(), None, text, is_utf8=True)
+    else:
+        found = _of_file(Path(model))
+    _require_model(found)
+    return found
+
+
+def is_text(model: object) -> bool:
+    """Whether a model is given as its text rather than as a file."""
+    return isinstance(model, str) and model.lstrip(_BLANK).startswith("<")
+
+
+def without_declaration(text: str) -> str:
+    """The text of a model for a file in UTF-8: without mark, and without the encoding that it had once."""
+    return _DECLARATION.sub("", text.lstrip(_BLANK), count=1)
+
+
+def is_file(path: str | Path) -> bool:
+    """Whether there is a regular file, for any path: one that no file can have is none."""
+    try:
+        return Path(path).is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def name_of(path: str | Path) -> str:
+    """A path as errors show it: as it is, or shortened and escaped."""
+    text = str(path)
+    return text if len(text) <= LONGEST_NAME and text.isprintable() else shown(text)
+
+
+def read_bytes(path: Path, what: str = "model") -> bytes:
+    """Content of a regular file of bounded size; nothing else is opened.
+
+    Raises:
+        ConfigurationError: It is no regular file, is too large, or cannot be read.
+    """
+    try:
+        facts = path.stat()
+    except (OSError, ValueError):
+        raise ConfigurationError(f"no {what} at {name_of(path)}; {_FILE}") from None
+    if not stat.S_ISREG(facts.st_mode):
+        raise ConfigurationError(f"no {what} at {name_of(path)}: it is no regular file; {_FILE}")
+    if facts.st_size > LARGEST_BYTES:
+        raise ConfigurationError(f"{name_of(path)} must have at most {LARGEST_BYTES} bytes, it has {facts.st_size}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"{name_of(path)} cannot be read: {error.strerror}; {_FILE}") from None
+
+
+def parse_xml(text: str, name: str) -> ET.Element:
+    """The elements and attributes of an XML text of bounded depth; `name` is what errors call it.
+
+    Raises:
+        ConfigurationError: It is no XML, is nested too deeply, or declares entities.
+    """
+    tree, depth = ET.TreeBuilder(), 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise ConfigurationError(
+                f"{name} must be nested at most {DEEPEST} elements deep; line {parser.CurrentLineNumber} is deeper"
+            )
+        tree.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        tree.end(tag)
+
+    def refuse_entity(entity: str, *_: Any) -> None:
+        raise ConfigurationError(
+            f"{name} declares the entity {shown(entity)}, which is not read; write its text out where it is used"
+        )
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.EntityDeclHandler = refuse_entity
+    try:
+        parser.Parse(text, True)
+        return tree.close()
+    except (expat.ExpatError, AssertionError, ValueError) as error:
+        if isinstance(error, ConfigurationError):
+            raise
+        raise ConfigurationError(f"{name} is no XML: {error}; {_FILE}") from None
+
+
+def _of_file(path: Path) -> ModelText:
+    name = name_of(path)
+    content = read_bytes(path)
+    text, is_utf8 = decoded(content, name)
+    return ModelText(parse_xml(text, name), name, path.resolve().parent, path, text, is_utf8)
+
+
+def decoded(content: bytes, name: str) -> tuple[str, bool]:
+    """The text of a file by its mark, or by the encoding that it declares; and whether that is UTF-8."""
+    encoding = next((own for mark, own in _MARKS if content.startswith(mark)), None)
+    if encoding is None:
+        declared = _DECLARED.match(content)
+        encoding = declared.group(1).decode("ascii") if declared else "utf-8"
+        if content[:4] in (b"<\0?\0", b"\0<\0?"):
+            encoding = "utf-16-le" if content[0] else "utf-16-be"
+    try:
+        codec = codecs.lookup(encoding)
+        if not codec._is_text_encoding or codec.name.replace("-", "_") in _NOT_OF_FILES:  # type: ignore[attr-defined]
+            raise LookupError
+        text = content.decode(encoding)
+    except LookupError:
+        raise ConfigurationError(
+            f"{name} declares the encoding {encoding!r}, which is not known; save the file in UTF-8"
+        ) from None
+    except (UnicodeError, ValueError):
+        raise ConfigurationError(
+            f"{name} is no XML: it is not in its encoding, {encoding}; save the file in UTF-8"
+        ) from None
+    return text.lstrip("\ufeff"), codec.name in ("utf-8", "utf-8-sig", "ascii")
+
+
+def _require_model(found: ModelText) -> None:
+    """Refuse what is neither MJCF nor URDF, and what xacro would expand."""
+    root, name = found.root, found.name
+    aliases = {_XACRO} | {
+        key.removeprefix("xmlns:") for key, value in root.attrib.items() if key.startswith("xmlns:") and _XACRO in value
+    }
+    for element in root.iter():
+        prefix = element.tag.partition(":")[0] if ":" in element.tag else ""
+        of_xacro = next((key for key in element.attrib if key.partition(":")[0] in aliases and ":" in key), None)
+        if prefix in aliases or of_xacro is not None:
+            what = f"<{element.tag}>" if prefix in aliases else f"the attribute {of_xacro}"
+            raise ConfigurationError(f"{name} is a file of xacro, it has {shown(what)[1:-1]}; {_EXPAND}")
+    if root.tag not in _KINDS:
+        raise ConfigurationError(f"the root of {name} must be <mujoco> or <robot>, got {shown(root.tag)}; {_FILE}")
+    if found.is_urdf:
+        for element in _parts(root):
+            unread = next((value for value in element.attrib.values() if _PLACEHOLDER.search(value)), None)
+            if unread is not None:
+                raise ConfigurationError(f"{name} has {shown(unread)} in <{element.tag}>, of xacro; {_EXPAND}")
+        old = next((part.tag for part in root if part.tag in _XACRO_PARTS), None)
+        if old is not None:
+            raise ConfigurationError(f"{name} is a file of xacro, it has <{old}>; {_EXPAND}")
+
+
+def _parts(robot: ET.Element) -> Iterator[ET.Element]:
+    """What describes the robot, not a simulator of it."""
+    yield robot
+    for part in robot:
+        if part.tag in ("link", "joint"):
+            yield from (element for element in part.iter() if element.tag in _URDF_PARTS)
