@@ -97,15 +97,15 @@ def shortened(text: object, longest: int = _LONGEST_SHOWN) -> str:
     return f"{whole[: longest - end - 3]}...{whole[-end:]}"
 
 
-_LONG = re.compile(rf"(?<!\w)'[^'\n]{{{_LONGEST_SHOWN},}}'(?!\w)|\S{{{_LONGEST_SHOWN + 1},}}")
-"""A quoted text or a word that is a user's by its length."""
+_PIECE = re.compile(r"(?<!\w)'[^'\n]*'(?!\w)|\S+")
+"""A quoted text, or a word. Quotes are paired from the left, so that nothing between two of them counts as one."""
 
 
 def readable(text: str) -> str:
     """A message without words, quoted texts or lines that would flood a terminal."""
     if len(text) <= _LONGEST_SHOWN:
         return text
-    short = _LONG.sub(lambda found: shortened(found[0]), text)
+    short = _PIECE.sub(lambda found: shortened(found[0]), text)
     return "\n".join(shortened(line, _LONGEST_LINE) for line in short.split("\n"))
 
 
