@@ -85,8 +85,8 @@ class JointSettings(Model):
 def read_joints(given: GivenJoints, names: list[str]) -> dict[str, JointSettings]:
     """Settings of the joints that are elastic, by name, in the order of the model.
 
-    A name goes before patterns, and a later pattern before an earlier one. Joints that nothing names, and those whose
-    value is "held", are left out.
+    A name goes before patterns, and a later pattern before an earlier one. Joints that nothing names, those whose value
+    is "held", and rigid ones, whose stiffness is infinite, are left out.
 
     Args:
         given: File or mapping.
@@ -107,13 +107,19 @@ def read_joints(given: GivenJoints, names: list[str]) -> dict[str, JointSettings
     for name in names:
         fitting = [key for key in mapping if fnmatchcase(name, key)]
         value = mapping[name if name in mapping else fitting[-1]] if fitting else HELD
-        if value != HELD:
+        if value != HELD and not _is_rigid(value):
             found[name] = _settings(name, value)
     if not found:
         raise ConfigurationError(
             f"joints gives no joint its stiffness K [N·m/rad]; choose from {', '.join(names)}, or '*' for all. {_CURE}"
         )
     return found
+
+
+def _is_rigid(value: Any) -> bool:
+    """Whether a joint is given an infinite K, as `elastic identify` writes it for a rigid joint."""
+    K = value.get("stiffness") if isinstance(value, Mapping) else value
+    return isinstance(K, float) and np.inf == K
 
 
 def _mapping(given: GivenJoints) -> Mapping[str, Any]:
