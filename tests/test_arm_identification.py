@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from baselines import PositionCompensator
 from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
 from baselines.identification.arm_result import JointStiffness, bounded_compliance, described
+from baselines.identification.log_signs import turned
 from baselines.identification.pose_log import Kind, PoseLog, read_log
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
@@ -381,11 +382,71 @@ def test_a_negative_estimate_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
     """Catches a joint that is stiffer than the log can tell, and of which neither file nor output says so."""
     log = log_of("link_encoders", 8)
     measured = log.measured.copy()
-    measured[:, 3] += 1.02 * (log.theta - OFFSET - measured)[:, 3]  # the elbow hardly bends, and to the wrong side
+    rigid = (log.theta - OFFSET)[:, 3]
+    noise = 3e-4 * np.random.default_rng(1).standard_normal(len(log))
+    measured[:, 3] = rigid + 0.01 * (rigid - measured[:, 3]) + noise  # it hardly bends, and to the wrong side
     joints = described(fit_arm(model_of(replace(log, measured=measured))), 0.03, None)
     assert [joint.joint for joint in joints.joints if joint.is_negative] == ["elbow"]
     file = joints.save(tmp_path)[1].read_text()
     assert "elbow: {stiffness: .inf}  # rigid: stiffer than the log can tell; the estimate is negative" in file
+
+
+ONE = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="j1" axis="0 1 0" range="-2 2"/>
+  <geom type="sphere" size="0.02" pos="0 0 {z}" mass="0.75"/></body></worldbody></mujoco>"""
+TWO = """<mujoco><compiler angle="radian"/><worldbody><body pos="0 0 0.1"><joint name="j1" axis="0 1 0" range="-2 2"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="2"/><body pos="0 0 0.3">
+  <joint name="j2" axis="0.3 1 0" range="-2 2"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="1"/>
+  </body></body></worldbody></mujoco>"""
+
+
+def encoders(xml: str, stiffness: list[float], count: int = 12) -> tuple[StaticArm, PoseLog]:
+    """An arm and its log of link encoders in the resolution of micrometres; MuJoCo's torque bends the springs."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    joints = tuple(model.joint(i).name for i in range(model.njnt))
+    q = np.random.default_rng(3).uniform(-1.2, 1.2, (count, len(joints)))
+    data = mujoco.MjData(model)
+    theta = q.copy()
+    for row, own in zip(theta, q, strict=True):
+        data.qpos[:] = own
+        mujoco.mj_forward(model, data)
+        row += data.qfrc_bias / stiffness
+    return StaticArm(model, joints), PoseLog(joints, np.round(theta, 6), "link_encoders", joints, np.round(q, 6))
+
+
+def fit_of(arm: StaticArm, log: PoseLog) -> Array:
+    """K of all joints, (n,) [N·m/rad]."""
+    return (
+        1.0
+        / fit_arm(PoseModel(arm, log, Unknowns.of(log, log.joints, "offset", payload=False))).estimate("compliance")[0]
+    )
+
+
+def test_encoders_that_are_swapped_are_named() -> None:
+    """Catches a contradiction to the model that is told as noise."""
+    arm, log = encoders(ONE.format(z=0.3), [300.0])
+    np.testing.assert_allclose(fit_of(arm, log), 300.0, rtol=1e-3)
+    with pytest.raises(ConfigurationError, match=r"deflect against their load: are theta and q swapped.*joint j1\)\?"):
+        fit_of(arm, replace(log, theta=log.measured, measured=log.theta))
+    with pytest.raises(ConfigurationError, match=r"run against each other: a sign is wrong \(joint j1\)"):
+        fit_of(arm, replace(log, measured=-log.measured))
+
+
+@pytest.mark.parametrize("joint", ["j1", "j2"])
+def test_a_joint_that_turns_the_other_way_is_named(joint: str) -> None:
+    """Catches a wrong sign of one joint of several, by a fit that is bad and one that is good with the sign turned."""
+    arm, log = encoders(TWO, [300.0, 150.0], count=20)
+    np.testing.assert_allclose(fit_of(arm, log), [300.0, 150.0], rtol=2e-3)
+    with pytest.raises(ConfigurationError, match=rf"a sign is wrong \(joint .*{joint}.*\)"):
+        fit_of(arm, turned(log, joint))
+    markers = log_of("end_effector", 8)
+    with pytest.raises(ConfigurationError, match=r"a sign is wrong \(joint elbow\)"):
+        fit_arm(model_of(turned(markers, "elbow")))
+
+
+def test_soft_springs_are_identified() -> None:
+    """Catches link angles that are refused where the load bends a spring by more than a radian."""
+    arm, log = encoders(ONE.format(z=-0.3), [1.8], count=30)  # m·g·l is 2.2 N·m
+    np.testing.assert_allclose(fit_of(arm, log), 1.8, rtol=1e-3)
 
 
 def test_twins_of_which_one_is_negative_share_what_both_explain() -> None:

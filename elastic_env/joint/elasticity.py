@@ -237,4 +237,4 @@ def _solved(relative_gradient: Array, right: Array) -> tuple[Array, BoolArray]:
 
 def _may_fold(relative_gradient: Array) -> BoolArray:
     """Rows whose load may overcome a spring: K⁻¹ ∂τ_g/∂q is not smaller than 1, (..., 1)."""
-    return np.abs(relative_gradient).sum(axis=-1).max(axis=-1, keepdims=True) >= 1.0
+    return np.asarray(np.abs(relative_gradient).sum(axis=-1).max(axis=-1, keepdims=True) >= 1.0)

@@ -20,8 +20,6 @@ _MOST_STEPS = 200
 _MOST_NEWTON_STEPS = 12
 _FARTHEST_RAD = 0.5
 """Largest way in one step: a longer one might leave the path."""
-_SMALLEST_STEP = 1e-8
-"""Share of the load: a path that needs smaller steps has ended."""
 _WOUND_RAD = np.pi
 """Deflection of other equilibria that count, at most: half a turn of the spring."""
 _SCANS = 96
@@ -38,17 +36,14 @@ class LoadPath:
         load: Share of the load there, (..., 1); 1 where the path leads to an equilibrium.
         joint: Joint that gives way most easily there, (...).
         other: Another stable equilibrium of that joint, nan where none is known, (...) [rad].
+        lost: Rows without an equilibrium that is the only one, (..., 1). If there is one, others may not be complete.
     """
 
     q: Array
     load: Array
     joint: IntArray
     other: Array
-
-    @property
-    def lost(self) -> BoolArray:
-        """Rows without an equilibrium that is the only one, (..., 1)."""
-        return (self.load < 1.0) | ~np.isnan(self.other)[..., None]
+    lost: BoolArray
 
     def reason(self, compliance: Array, names: Sequence[str] | None = None) -> str:
         """Sentences that say why the first lost row has no equilibrium, with the joint.
@@ -83,6 +78,7 @@ def follow_load(
     rows: BoolArray | None = None,
     within: tuple[Array, Array] | None = None,
     unique: bool = True,
+    finest: float = 1e-8,
 ) -> LoadPath:
     """Follow the equilibrium from no load to the whole one.
 
@@ -97,12 +93,14 @@ def follow_load(
         rows: Rows to follow, (..., 1); the others stay at θ with the whole load. None for all.
         within: Lowest and highest angles of other equilibria that count, (n,) each [rad].
         unique: Whether to look for other equilibria.
+        finest: Share of the load in a step, at least. A path that needs smaller steps has ended.
     """
     springs = _Springs(theta, np.broadcast_to(compliance, theta.shape), torque, torque_gradient, tolerance)
     is_open = np.ones((*theta.shape[:-1], 1), dtype=np.bool_) if rows is None else rows
     q = theta
     load = np.where(is_open, 0.0, 1.0)
     step = np.ones_like(load)
+    lost = ~is_open
     for _ in range(_MOST_STEPS):
         target = np.minimum(load + step, 1.0)
         trial, is_stable = springs.settle(q, target, is_open)
@@ -110,15 +108,20 @@ def follow_load(
         q = np.where(taken, trial, q)
         load = np.where(taken, target, load)
         step = np.where(taken, 2.0 * step, 0.25 * step)
-        is_open = is_open & (load < 1.0) & (step > _SMALLEST_STEP)
-        if not is_open.any():
+        is_open = is_open & (load < 1.0)
+        lost = is_open & (step < finest)
+        if lost.any() or not is_open.any():
             break
-    joint = springs.softest(q, load)
+    else:
+        lost = is_open
+    joint = np.zeros(theta.shape[:-1], dtype=np.int64)
     other = np.full(theta.shape[:-1], np.nan)
-    if unique:
-        reached = (load >= 1.0) if rows is None else (load >= 1.0) & rows
-        joint, other = springs.others(q, reached, joint, within)
-    return LoadPath(q, load, joint, other)
+    if lost.any():
+        joint = springs.softest(q, load)
+    elif unique:
+        joint, other = springs.others(q, np.ones_like(lost) if rows is None else rows, within)
+        lost = ~np.isnan(other)[..., None]
+    return LoadPath(q, load, joint, other, lost)
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class _Springs:
         for _ in range(_MOST_NEWTON_STEPS):
             residual = q - self.theta + C * self.torque(q)
             matrix = self._matrix(q, C, is_good)
-            is_good = is_good & (np.linalg.eigvals(matrix).real.min(axis=-1, keepdims=True) > 0.0)
+            is_good = is_good & (np.real(np.linalg.eigvals(matrix)).min(axis=-1, keepdims=True) > 0.0)
             size = self.tolerance * (1.0 + np.abs(q).max(axis=-1, keepdims=True))
             is_done = is_done | (np.abs(residual).max(axis=-1, keepdims=True) <= size)
             moves = is_good & ~is_done
@@ -157,16 +160,15 @@ class _Springs:
         """Joint that moves most in the direction that gives way most easily, (...)."""
         matrix = self._matrix(q, load * self.compliance, np.ones_like(load, dtype=np.bool_))
         values, vectors = np.linalg.eig(matrix)
-        least = values.real.argmin(axis=-1)[..., None, None]
+        least = np.real(values).argmin(axis=-1)[..., None, None]
         return np.abs(np.take_along_axis(vectors, least, axis=-1)[..., 0]).argmax(axis=-1)
 
-    def others(
-        self, q: Array, rows: BoolArray, joint: IntArray, within: tuple[Array, Array] | None
-    ) -> tuple[IntArray, Array]:
+    def others(self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None) -> tuple[IntArray, Array]:
         """Joints that can rest elsewhere, and where, nan for none: found along each joint alone, then of all joints."""
         n = q.shape[-1]
         lowest, highest = (np.full(n, -np.inf), np.full(n, np.inf)) if within is None else within
         other = np.full(q.shape[:-1], np.nan)
+        joint = np.zeros(q.shape[:-1], dtype=np.int64)
         whole = np.ones_like(rows, dtype=np.float64)
         for i in range(n):
             for start in self._crossings(q, i):

@@ -14,7 +14,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from baselines.identification.arm_fit import USUAL_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
+from baselines.identification.arm_fit import (
+    FAR_BEYOND,
+    USUAL_EVALUATIONS,
+    USUAL_NOISE,
+    ArmFit,
+    fit_arm,
+    in_unit,
+    require_poses,
+    summed_up,
+)
 from baselines.identification.arm_result import NEGATIVE, ArmIdentification, JointStiffness, Source, described
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
@@ -35,10 +44,6 @@ from train.figures.arm_plots import draw_arm_identification
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
-_USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
-"""Noise of usual sensors, which a plan without a log assumes [m], [rad], [N·m]."""
-_FAR_BEYOND = 10.0
-"""Ratio of residuals and usual noise from which on the output warns."""
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
@@ -154,8 +159,8 @@ def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
     if negative := [joint.joint for joint in result.joints if joint.is_negative]:
         lines.append(f"{', '.join(negative)}: {NEGATIVE}")
     lines += _written_lines(result.joints)
-    usual = _USUAL_NOISE[result.measurement]
-    if result.residual_spread > _FAR_BEYOND * usual:
+    usual = USUAL_NOISE[result.measurement]
+    if result.residual_spread > FAR_BEYOND * usual:
         lines.append(
             f"the residuals are far beyond the usual noise of {in_unit(usual, result.measurement)}: look for other "
             "elastic joints, another frame (--frame) or body (--end-effector), friction, and errors of the model"
@@ -257,7 +262,7 @@ def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
 def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, console: Console) -> None:
     """Plan without a log: with usual noise, and deflections of a usual size."""
     candidates = _candidates(config, setting, console)
-    model, noise = setting.model(config, candidates), _USUAL_NOISE[setting.log.kind]
+    model, noise = setting.model(config, candidates), USUAL_NOISE[setting.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
     plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, config.plan)
     own = model.unknowns.slices["compliance"]
