@@ -358,6 +358,18 @@ def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> N
     assert env.action_space.shape == (6,)
 
 
+def test_joints_that_are_not_sought_stand_in_the_file_as_rigid() -> None:
+    """Catches a file that the compensator refuses, since it lacks joints that the docs call rigid."""
+    run("--log", str(EXAMPLE), "--joints", "elbow", "wrist_*", "--output", "found")
+    stiffness = parse_yaml(Path("found/joints.yaml").read_text())
+    assert set(stiffness) == set(JOINTS)
+    assert stiffness["shoulder_pitch"] == {"stiffness": math.inf}
+    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
+    q = np.full(7, 0.3)
+    assert (compensator.command(q) == q).tolist() == [True, True, True, False, True, False, False]
+    assert RESULT.replace(held_joints=("no",)).save(Path())[1].read_text().endswith("'no': held  # not in the log\n")
+
+
 def of_elbow(compliance: float, half_width: float) -> JointStiffness:
     """What is written of a joint whose 1/K is estimated in the middle of an interval; the others are well known."""
     fit = fit_arm(model_of(log_of("end_effector", 8)))

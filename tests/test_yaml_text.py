@@ -70,3 +70,4 @@ def test_names_and_numbers_are_read_as_they_were_written(names: list[str], numbe
     lines = [yaml_line(name, own, f"± 2 % beside {names[0]}") for name, own in content.items()]
     assert parse_yaml("\n".join(["# a head", *lines])) == content
     assert parse_yaml(yaml_of(content)) == content
+    assert parse_yaml(yaml_line(names[0], "held", "not in the log")) == {names[0]: "held"}

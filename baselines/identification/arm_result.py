@@ -10,6 +10,7 @@ from pydantic import Field
 from baselines.identification.arm_fit import ArmFit
 from baselines.identification.pose_log import Kind
 from baselines.identification.pose_model import SMALLEST_LOAD
+from baselines.identification.static_arm import hinges_of
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
@@ -75,6 +76,10 @@ class ArmIdentification(Model):
     """Standard deviation of the residuals [m], [rad] or [N·m]."""
     friction_is_noise: bool
     """Whether the log has no sides of approach, so that friction widens the intervals."""
+    rigid_joints: tuple[str, ...] = ()
+    """Joints of the log that were taken as rigid."""
+    held_joints: tuple[str, ...] = ()
+    """Hinges of the model that the log does not have: they were held."""
     outlying_poses: tuple[int, ...]
     """Poses of the log, counted from 1, whose residual is far beyond the others'."""
 
@@ -88,6 +93,8 @@ class ArmIdentification(Model):
         files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
         head = "# stiffness [N·m/rad], by elastic identify; .inf for a rigid joint"
         lines = [yaml_line(joint.joint, {"stiffness": _written(joint)}, _comment(joint)) for joint in self.joints]
+        lines += [yaml_line(name, {"stiffness": math.inf}, "rigid: not sought") for name in self.rigid_joints]
+        lines += [yaml_line(name, "held", "not in the log") for name in self.held_joints]
         files[1].write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
         return files
 
@@ -114,15 +121,19 @@ def described(fit: ArmFit, within: float, assumed: float | None, planned: Array 
     after = None if planned is None else expected_half_width(fit, planned)
     joints = tuple(_joint(fit, i, within, assumed, why[i], after) for i in range(len(compliance)))
     payload, payload_half = _first_known(fit, "payload")
+    log = fit.model.log
+    sought = [joint.joint for joint in joints]
     return ArmIdentification(
-        measurement=fit.model.log.kind,
+        measurement=log.kind,
         poses=len(fit.q),
         within=within,
         joints=joints,
         payload_kg=payload,
         payload_half_width_kg=payload_half,
         residual_spread=fit.spread,
-        friction_is_noise=fit.model.log.direction is None,
+        friction_is_noise=log.direction is None,
+        rigid_joints=tuple(joint for joint in log.joints if joint not in sought),
+        held_joints=tuple(joint for joint in hinges_of(fit.model.arm.model) if joint not in log.joints),
         outlying_poses=tuple(int(pose) + 1 for pose in fit.outliers),
     )
 

@@ -122,7 +122,8 @@ def yaml_line(name: str, value: Any, comment: str) -> str:
         value: Plain data without a mapping or list in it that holds another one.
         comment: Its characters that do not print become spaces.
     """
-    text = yaml.dump({name: value}, Dumper=_Dumper, allow_unicode=True, default_flow_style=None, width=_NO_FOLDING)
+    flow = None if isinstance(value, dict | list) else False  # None: only what holds no mapping or list
+    text = yaml.dump({name: value}, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=_NO_FOLDING)
     printed = "".join(char if char.isprintable() else " " for char in comment)
     return f"{text.rstrip()}  # {printed}"
 

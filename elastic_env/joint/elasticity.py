@@ -228,11 +228,12 @@ def _solved(relative_gradient: Array, right: Array) -> tuple[Array, BoolArray]:
         is_zero = np.linalg.det(matrix)[..., None] == 0.0
         solution = np.linalg.solve(np.where(is_zero[..., None], np.eye(n), matrix), right[..., None])[..., 0]
         solution = np.where(is_zero, np.inf, solution)
-    is_large = ~(np.abs(solution) < np.pi).all(axis=-1, keepdims=True)
+    is_large: BoolArray = ~np.all(np.abs(solution) < np.pi, axis=-1, keepdims=True)
     if not is_large.any():
         return solution, is_large
     # no deflection: worth a closer look
-    return solution, is_large & (np.abs(np.linalg.det(matrix))[..., None] < _SINGULAR)
+    is_singular: BoolArray = is_large & (np.abs(np.linalg.det(matrix))[..., None] < _SINGULAR)
+    return solution, is_singular
 
 
 def _may_fold(relative_gradient: Array) -> BoolArray:

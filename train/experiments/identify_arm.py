@@ -18,7 +18,6 @@ from baselines.identification.arm_fit import (
     FAR_BEYOND,
     USUAL_EVALUATIONS,
     USUAL_NOISE,
-    ArmFit,
     fit_arm,
     in_unit,
     require_poses,
@@ -125,7 +124,7 @@ def run_arm_identification(
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
         files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
     console.print(result_table(result))
-    for line in [summed_up(fit), *remarks(result, fit)]:
+    for line in [summed_up(fit), *remarks(result)]:
         console.print(escape(line), highlight=False)
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True, markup=False)
@@ -148,7 +147,7 @@ def result_table(result: ArmIdentification) -> Table:
     return table
 
 
-def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
+def remarks(result: ArmIdentification) -> list[str]:
     """What the table does not say: the payload, joints that are not told apart, and poses that do not fit."""
     lines = []
     if result.payload_half_width_kg is not None:
@@ -167,9 +166,8 @@ def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
         )
     if result.outlying_poses:
         lines.append(f"poses that do not fit the others: {', '.join(map(str, result.outlying_poses))}; check them")
-    held = [joint for joint in hinges_of(fit.model.arm.model) if joint not in fit.model.log.joints]
-    if held:
-        lines.append(f"not in the log, and taken as held where the model has them: {', '.join(held)}")
+    if result.held_joints:
+        lines.append(f"not in the log, and taken as held where the model has them: {', '.join(result.held_joints)}")
     if any(joint.reason for joint in result.joints) and result.joints[0].planned_half_width is None:
         lines.append("--plan 20 proposes poses that tell more")
     return lines + _beyond_any_plan(result.joints)
