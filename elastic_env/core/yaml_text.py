@@ -103,9 +103,14 @@ def parse_yaml(text: str) -> Any:
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's, which puts quotes around text that `parse_yaml` would read as a number, such as 1e3."""
+    """PyYAML's, with quotes around text that `parse_yaml` would read as a number, such as 1e3, or would fold."""
+
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        """Text; with escapes where it holds line ends or other characters that do not print."""
+        return self.represent_scalar(f"{_TAG}str", text, style=None if text.isprintable() else '"')
 
 
+_Dumper.add_representer(str, _Dumper.represent_text)
 _Dumper.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
 
 
