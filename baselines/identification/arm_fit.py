@@ -36,7 +36,7 @@ FAR_BEYOND = 10.0
 """Ratio of residuals and usual noise from which on the log does not fit the arm."""
 MOST_EVALUATIONS = 100
 """Steps after which a fit goes on with steps in units of the derivatives."""
-_FURTHER_EVALUATIONS = 300
+_FURTHER_EVALUATIONS = 150
 USUAL_EVALUATIONS = 12
 """Steps of a usual fit, at most."""
 

@@ -38,7 +38,7 @@ _PRIOR = {"offset": 0.3, "payload_kg": 10.0, "translation_m": 1.0, "rotation_rad
 _FIRST_ITERATIONS, _MOST_ITERATIONS, _LAST_STEP_RAD = 6, 50, 1e-12
 _SOFT = 0.5
 """Change of the deflection by that of the link angle from which on the load is followed."""
-_FINEST_STEP = 1e-3
+_FINEST_STEP = 0.05
 """Share of the load in a step of a path, at least."""
 _FARTHEST_RAD = 1e3
 """Deflections beyond this are none."""
