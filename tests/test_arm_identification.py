@@ -1,21 +1,29 @@
 """Stiffness of an arm from static poses: against equilibria of MuJoCo, with intervals that hold the truth."""
 
 import csv
+import json
 import math
+import sys
+import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from baselines import PositionCompensator
 from baselines.identification.arm_fit import ArmFit, fit_arm, information_of
-from baselines.identification.arm_result import described
+from baselines.identification.arm_result import JointStiffness, bounded_compliance, described
+from baselines.identification.log_signs import turned
 from baselines.identification.pose_log import Kind, PoseLog, read_log
 from baselines.identification.pose_model import PoseModel, Unknowns
 from baselines.identification.pose_plan import candidate_poses, plan_further
@@ -27,6 +35,7 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from train.commands.cli import main
+from train.experiments.identify_arm import result_table
 from train.figures.arm_plots import deflections
 
 FOLDER = Path(__file__).parents[1] / "docs" / "identification"
@@ -306,6 +315,7 @@ def test_figure_shows_the_deflections_of_the_springs(kind: Kind) -> None:
 # From here on the command, its files, and what it refuses.
 
 EXAMPLE = FOLDER / "poses.csv"
+RESULT = described(fit_arm(model_of(log_of("link_encoders", 8))), 0.03, None)
 
 
 @pytest.fixture(autouse=True)
@@ -332,6 +342,161 @@ def test_command_on_the_example_writes_what_the_compensator_takes(capsys: pytest
     rows = list(csv.reader(Path("found/plan.csv").read_text().splitlines()))
     assert len(rows) == 6
     assert rows[0][0] == "theta.base_yaw [rad]"
+
+
+def test_a_joint_of_which_the_poses_say_nothing_is_rigid_for_every_reader() -> None:
+    """Catches a stiff joint that is written as soft as another one, and a file that one of its readers refuses."""
+    run("--log", str(EXAMPLE), "--output", "found")
+    stiffness = parse_yaml(Path("found/joints.yaml").read_text())
+    assert stiffness["base_yaw"] == {"stiffness": math.inf}
+    of_base = json.loads(Path("found/identification.json").read_text())["joints"][0]
+    assert (of_base["source"], of_base["stiffness_nm_per_rad"], of_base["friction_nm"]) == ("rigid", None, None)
+    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
+    q = np.full(7, 0.3)
+    np.testing.assert_allclose(compensator.command(q) - q, [0.0, *(compensator.torque(q) / K)[1:]], rtol=0.12)
+    env: Any = gymnasium.make("elastic_env/Robot-v0", model=str(FOLDER / "arm.xml"), joints="found/joints.yaml")
+    assert env.action_space.shape == (6,)
+
+
+def test_joints_that_are_not_sought_stand_in_the_file_as_rigid() -> None:
+    """Catches a file that the compensator refuses, since it lacks joints that the docs call rigid."""
+    run("--log", str(EXAMPLE), "--joints", "elbow", "wrist_*", "--output", "found")
+    stiffness = parse_yaml(Path("found/joints.yaml").read_text())
+    assert set(stiffness) == set(JOINTS)
+    assert stiffness["shoulder_pitch"] == {"stiffness": math.inf}
+    compensator = PositionCompensator.from_model(FOLDER / "arm.xml", "found/joints.yaml")
+    q = np.full(7, 0.3)
+    assert (compensator.command(q) == q).tolist() == [True, True, True, False, True, False, False]
+    assert RESULT.replace(held_joints=("no",)).save(Path())[1].read_text().endswith("'no': held  # not in the log\n")
+
+
+def of_elbow(compliance: float, half_width: float) -> JointStiffness:
+    """What is written of a joint whose 1/K is estimated in the middle of an interval; the others are well known."""
+    fit = fit_arm(model_of(log_of("end_effector", 8)))
+    own = fit.model.unknowns.slices["compliance"]
+    unknowns = fit.unknowns.copy()
+    covariance = fit.covariance.copy()
+    unknowns[own.start + 3] = compliance
+    covariance[own.start + 3, own.start + 3] = (half_width / fit.quantile) ** 2
+    return described(replace(fit, unknowns=unknowns, covariance=covariance), 0.03, None).joints[3]
+
+
+def test_an_estimate_is_written_as_it_is_and_a_negative_one_as_rigid() -> None:
+    """Catches the largest K of other joints in place of a joint's own, and a negative 1/K in silence."""
+    stiff = of_elbow(1e-5, 2e-5)
+    assert (stiff.source, stiff.stiffness_nm_per_rad) == ("no upper end", pytest.approx(1e5))
+    assert stiff.stiffness_low_nm_per_rad == pytest.approx(1.0 / 3e-5)
+    negative = of_elbow(-1e-5, 2e-5)
+    assert (negative.source, negative.stiffness_nm_per_rad, negative.is_negative) == ("rigid", math.inf, True)
+
+
+def test_a_negative_estimate_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a joint that is stiffer than the log can tell, and of which neither file nor output says so."""
+    log = log_of("link_encoders", 8)
+    measured = log.measured.copy()
+    rigid = (log.theta - OFFSET)[:, 3]
+    noise = 3e-4 * np.random.default_rng(1).standard_normal(len(log))
+    measured[:, 3] = rigid + 0.01 * (rigid - measured[:, 3]) + noise  # it hardly bends, and to the wrong side
+    joints = described(fit_arm(model_of(replace(log, measured=measured))), 0.03, None)
+    assert [joint.joint for joint in joints.joints if joint.is_negative] == ["elbow"]
+    file = joints.save(tmp_path)[1].read_text()
+    assert "elbow: {stiffness: .inf}  # rigid: stiffer than the log can tell; the estimate is negative" in file
+
+
+ONE = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="j1" axis="0 1 0" range="-2 2"/>
+  <geom type="sphere" size="0.02" pos="0 0 {z}" mass="0.75"/></body></worldbody></mujoco>"""
+TWO = """<mujoco><compiler angle="radian"/><worldbody><body pos="0 0 0.1"><joint name="j1" axis="0 1 0" range="-2 2"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="2"/><body pos="0 0 0.3">
+  <joint name="j2" axis="0.3 1 0" range="-2 2"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="1"/>
+  </body></body></worldbody></mujoco>"""
+
+
+def encoders(xml: str, stiffness: list[float], count: int = 12) -> tuple[StaticArm, PoseLog]:
+    """An arm and its log of link encoders in the resolution of micrometres; MuJoCo's torque bends the springs."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    joints = tuple(model.joint(i).name for i in range(model.njnt))
+    q = np.random.default_rng(3).uniform(-1.2, 1.2, (count, len(joints)))
+    data = mujoco.MjData(model)
+    theta = q.copy()
+    for row, own in zip(theta, q, strict=True):
+        data.qpos[:] = own
+        mujoco.mj_forward(model, data)
+        row += data.qfrc_bias / stiffness
+    return StaticArm(model, joints), PoseLog(joints, np.round(theta, 6), "link_encoders", joints, np.round(q, 6))
+
+
+def fit_of(arm: StaticArm, log: PoseLog) -> Array:
+    """K of all joints, (n,) [N·m/rad]."""
+    return (
+        1.0
+        / fit_arm(PoseModel(arm, log, Unknowns.of(log, log.joints, "offset", payload=False))).estimate("compliance")[0]
+    )
+
+
+def test_encoders_that_are_swapped_are_named() -> None:
+    """Catches a contradiction to the model that is told as noise."""
+    arm, log = encoders(ONE.format(z=0.3), [300.0])
+    np.testing.assert_allclose(fit_of(arm, log), 300.0, rtol=1e-3)
+    with pytest.raises(ConfigurationError, match=r"deflect against their load: are theta and q swapped.*joint j1\)\?"):
+        fit_of(arm, replace(log, theta=log.measured, measured=log.theta))
+    with pytest.raises(ConfigurationError, match=r"run against each other: a sign is wrong \(joint j1\)"):
+        fit_of(arm, replace(log, measured=-log.measured))
+
+
+@pytest.mark.parametrize("joint", ["j1", "j2"])
+def test_a_joint_that_turns_the_other_way_is_named(joint: str) -> None:
+    """Catches a wrong sign of one joint of several, by a fit that is bad and one that is good with the sign turned."""
+    arm, log = encoders(TWO, [300.0, 150.0], count=20)
+    np.testing.assert_allclose(fit_of(arm, log), [300.0, 150.0], rtol=2e-3)
+    with pytest.raises(ConfigurationError, match=rf"a sign is wrong \(joint .*{joint}.*\)"):
+        fit_of(arm, turned(log, joint))
+    markers = log_of("end_effector", 8)
+    with pytest.raises(ConfigurationError, match=r"a sign is wrong \(joint elbow\)"):
+        fit_arm(model_of(turned(markers, "elbow")))
+
+
+def test_soft_springs_are_identified() -> None:
+    """Catches link angles that are refused where the load bends a spring by more than a radian."""
+    arm, log = encoders(ONE.format(z=-0.3), [1.8], count=30)  # m·g·l is 2.2 N·m
+    np.testing.assert_allclose(fit_of(arm, log), 1.8, rtol=1e-3)
+
+
+def test_twins_of_which_one_is_negative_share_what_both_explain() -> None:
+    """Catches a joint that is written as too soft, beside a twin whose negative estimate made up for it."""
+    fit = fit_arm(model_of(log_of("end_effector", 8)))
+    own = fit.model.unknowns.slices["compliance"]
+    information = fit.information.copy()
+    unknowns = fit.unknowns.copy()
+    size = fit.model.scale[own]
+    twins = np.zeros((7, 7))
+    twins[5:, 5:] = [[1.0, 0.999], [0.999, 1.0]]  # the log tells their sum alone
+    information[own, own] += 1e9 * twins
+    unknowns[own][5:] = np.array([0.03, -0.02]) * size[5:]
+    best = bounded_compliance(replace(fit, unknowns=unknowns, information=information)) / size
+    assert best[6] == 0.0
+    assert best[5] == pytest.approx(0.01, abs=1e-4)
+
+
+def test_offsets_that_the_poses_do_not_tell_are_not_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches hundreds of milliradians that are the prior's, in table and file."""
+    log = log_of("link_encoders", 8)
+    without_base = replace(log, columns=JOINTS[1:], measured=log.measured[:, 1:])
+    result = described(fit_arm(model_of(without_base)), 0.03, None)
+    assert result.joints[0].offset_rad is None
+    assert result.joints[1].offset_rad == pytest.approx(OFFSET[1], abs=1e-3)
+    Console(file=sys.stdout, width=200).print(result_table(result))
+    of_base = next(line for line in capsys.readouterr().out.splitlines() if "base_yaw" in line)
+    assert of_base.split() == ["base_yaw", "–", "–", ">", "100", "%", "–"]
+
+
+@given(names=st.lists(st.text("01no.~e\"'#: -[]{}é", min_size=1, max_size=6), min_size=7, max_size=7, unique=True))
+def test_joints_of_any_name_are_read_back(names: list[str]) -> None:
+    """Catches names that the file's reader takes for numbers, truth values or YAML."""
+    joints = tuple(joint.replace(joint=name) for joint, name in zip(RESULT.joints, names, strict=True))
+    renamed = RESULT.replace(joints=joints)
+    with tempfile.TemporaryDirectory() as folder:
+        file = renamed.save(Path(folder))[1]
+        assert list(parse_yaml(file.read_text(encoding="utf-8"))) == names
 
 
 def test_first_poses_are_planned_without_a_log(capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,6 +103,10 @@ def test_a_file_is_played_through_its_rows(tmp_path: Path) -> None:
         ("t,elbow\n0,1\n1,2\n", r"first column of .* must be time_s, got 't'"),
         ("time_s,elbow\n1,1\n0,2\n", r"must increase"),
         ("time_s,elbow\n0,x\n1,2\n", r"rows of numbers"),
+        ("time_s;elbow\n0;1\n1;2\n", r"separated by semicolons; use commas, and points in numbers"),
+        ("time_s,elbow\n0,1\n", r"two rows or more"),
+        ("time_s,elbow\n0,1\n1e-300,2\n", r"rows at least 1e-06 s apart, and angles within"),
+        ("time_s,elbow\n0,1\n1,1e300\n", r"angles within ±10000 rad"),
     ):
         file.write_text(text)
         with pytest.raises(ConfigurationError, match=message):

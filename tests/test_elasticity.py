@@ -1,9 +1,11 @@
 """The spring, its inverse and Eq. 10, against MuJoCo's passive forces, closed forms and SciPy."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import optimize
@@ -243,3 +245,47 @@ def test_backlash_of_half_a_turn_is_refused() -> None:
     """Catches a dead band wider than any gear, which is most likely given in degrees."""
     with pytest.raises(ConfigurationError, match=r"backlash must be below half a turn, 3\.1416 rad, got 5\.0"):
         ElasticJoint(stiffness=1001.0, rotor_inertia=0.8, backlash=5.0)
+
+
+def pendulum(load: float) -> tuple[Any, Any]:
+    """Torque of a hanging pendulum that bends a spring of 1 N·m/rad by `load`, and its gradient."""
+    return lambda q: load * np.sin(q), lambda q: (load * np.cos(q))[..., None]
+
+
+@settings(max_examples=60)
+@given(theta=st.floats(-np.pi, np.pi), load=st.floats(-6.0, 6.0))
+def test_soft_springs_are_solved_wherever_one_equilibrium_exists(theta: float, load: float) -> None:
+    """Catches Newton steps that fail, or end at an unstable pose, on soft springs; all roots are the judge."""
+    grid = np.linspace(theta - 7.0, theta + 7.0, 200_001)
+    values = grid - theta + load * np.sin(grid)
+    roots = grid[np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))]
+    assume(np.abs(1.0 + load * np.cos(roots)).min() > 0.02)  # neither do they begin to exist here
+    assume(np.abs(np.abs(roots - theta) - np.pi).min() > 1e-3)
+    near = roots[np.abs(roots - theta) < np.pi]
+    if len(near) > 1:
+        with pytest.raises(ElasticError, match=r"joint 1 of 1 \(1 N·m/rad\) too low.*(bistable|tips over)"):
+            static_link_angle(np.array([theta]), 1.0, *pendulum(load))
+    elif len(near) == 1:
+        q = static_link_angle(np.array([theta]), 1.0, *pendulum(load))
+        assert q[0] == pytest.approx(near[0], abs=1e-3)
+
+
+def test_of_several_equilibria_a_growing_load_leads_to_one() -> None:
+    """Catches the wrong side of an inverted pendulum, to which the first Newton step leads."""
+    q = static_link_angle(np.array([0.1]), 1.0, *pendulum(-1.1), unique=False)[0]
+    assert q > 0.5
+    assert q - 0.1 == pytest.approx(1.1 * np.sin(q), abs=1e-12)
+    with pytest.raises(ElasticError, match=r"At 90\.9 % of the load .* singular: the link tips over"):
+        static_link_angle(np.array([0.0]), 1.0, *pendulum(-1.1), unique=False)
+
+
+def test_soft_and_stiff_rows_of_a_batch_are_those_alone() -> None:
+    """Catches a row whose steps depend on whether another one needs the load to grow, to the last bit."""
+    theta = np.random.default_rng(8).uniform(-1.0, 1.0, (12, 2))
+    K = np.where(np.arange(12)[:, None] % 2, [300.0, 90.0], [4.0, 3.0])
+    q = static_link_angle(theta, K, two_link_torque, two_link_gradient, unique=False)
+    np.testing.assert_allclose(K * (theta - q), two_link_torque(q), atol=1e-10)
+    for row in range(12):
+        alone = static_link_angle(theta[row], K[row], two_link_torque, two_link_gradient, unique=False)
+        np.testing.assert_array_equal(q[row], alone)
+    assert np.isnan(static_link_angle(np.array([[np.nan], [0.1]]), 1.0, *pendulum(0.5))[0, 0])

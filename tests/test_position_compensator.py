@@ -345,13 +345,37 @@ def test_files_that_are_no_model_are_refused(tmp_path: Path) -> None:
             PositionCompensator.from_model(path, 900.0)
 
 
-def test_a_load_that_overcomes_a_spring_is_said() -> None:
-    """Catches link angles that are no solution of Eq. 10."""
+def test_soft_springs_are_solved_where_one_equilibrium_exists() -> None:
+    """Catches link angles that are refused, or are no solution of Eq. 10, where m·g·l/K is far beyond 1."""
     without_spring = mujoco.MjModel.from_xml_string(ARM.replace('stiffness="12"', ""))
     weak = PositionCompensator.from_model(without_spring, {"*": 400.0, "shoulder": 1.5}, joints=JOINTS)
     weak.set_payload(5.0)
-    with pytest.raises(ElasticError, match=re.escape("stiffness of shoulder (1.5 N·m/rad) too low")):
-        weak.link_angle(np.zeros(3))
+    K = np.array([400.0, 400.0, 1.5])
+    for theta in np.array([[0.0, 0.0, 0.0], [0.9, 0.3, 0.5], [-0.4, -1.0, 0.9]]):
+        q = weak.link_angle(theta)
+        np.testing.assert_allclose(K * (theta - q), weak.torque(q), atol=1e-8)
+        assert np.abs(theta - q).max() > 0.1
+
+
+UPRIGHT = """<mujoco><compiler angle="radian"/><worldbody><body>
+  <joint name="shoulder" axis="0 1 0" range="{0} 2"/><geom type="sphere" size="0.01" pos="0 0 0.3" mass="{1}"/>
+  <body pos="0 0 0.3"><joint name="wrist" axis="0 0 1"/><geom size="0.01" mass="0.1"/></body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(("theta", "words"), [(0.0, "the link tips over"), (0.1, "bistable: the link can rest at")])
+def test_a_load_that_overcomes_a_spring_is_said(theta: float, words: str) -> None:
+    """Catches an unstable pose, and one of two stable ones, that are given as where the link is."""
+    upright = mujoco.MjModel.from_xml_string(UPRIGHT.format(-2, 2))  # 2.1 kg at 0.3 m: 6.2 N·m/rad
+    weak = PositionCompensator.from_model(upright, {"shoulder": 4.5, "wrist": math.inf})
+    with pytest.raises(ElasticError, match=re.escape("stiffness of shoulder (4.5 N·m/rad) too low") + f".*{words}"):
+        weak.link_angle([theta, 0.3])
+    assert weak.link_angle([1.9, 0.3])[0] > 1.9
+    fenced = mujoco.MjModel.from_xml_string(UPRIGHT.format(-0.1, 2))  # the other pose is out of its range
+    assert PositionCompensator.from_model(fenced, [4.5, math.inf]).link_angle([0.1, 0.0])[0] > 0.5
+    firm = PositionCompensator.from_model(upright, {"shoulder": 6.5, "wrist": math.inf})
+    q = firm.link_angle([theta, 0.3])
+    assert 6.5 * (q[0] - theta) == pytest.approx(-firm.torque(q)[0], abs=1e-9)
 
 
 def test_servos_of_the_model_that_give_way_are_named() -> None:

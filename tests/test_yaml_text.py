@@ -1,11 +1,14 @@
 """YAML of configurations: its limits, and what it does not make of text."""
 
+import math
 import time
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
-from elastic_env.core.yaml_text import DEEPEST_NESTING, parse_yaml
+from elastic_env.core.yaml_text import DEEPEST_NESTING, parse_yaml, yaml_line, yaml_of
 
 LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 9)
@@ -70,3 +73,20 @@ def test_a_star_without_quotes_gets_its_cure(text: str, cure: str) -> None:
     with pytest.raises(yaml.YAMLError) as said:
         parse_yaml(text)
     assert f"put the pattern in quotes: {cure}\n" in f"{said.value}"
+
+
+NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), min_size=1, max_size=200) | (
+    st.sampled_from(
+        ["0", "no", "null", "~", "1e3", "-1E-3", "0x1f", "1_0", ".inf", "2020-01-01", "<<", "=", 'x"y', "#"]
+    )
+)
+
+
+@given(names=st.lists(NAMES, min_size=1, max_size=4, unique=True), number=st.floats(1e-9, 1e12) | st.just(math.inf))
+def test_names_and_numbers_are_read_as_they_were_written(names: list[str], number: float) -> None:
+    """Catches a name without quotes that is read as a number or a truth value, and one that ends its line."""
+    content = {name: {"stiffness": number} for name in names}
+    lines = [yaml_line(name, own, f"± 2 % beside {names[0]}") for name, own in content.items()]
+    assert parse_yaml("\n".join(["# a head", *lines])) == content
+    assert parse_yaml(yaml_of(content)) == content
+    assert parse_yaml(yaml_line(names[0], "held", "not in the log")) == {names[0]: "held"}

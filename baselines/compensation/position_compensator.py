@@ -30,6 +30,7 @@ from elastic_env.joint.known_torque import (
     home_of,
     require_known_torque,
 )
+from elastic_env.joint.load_path import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.motion.trajectory import minimum_jerk
@@ -40,6 +41,13 @@ PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 _LAST_STEP_RAD = 1e-8
 """A step below this is the last one: what it leaves is smaller by the factor with which Newton's steps shrink."""
 _MOST_ITERATIONS = 50
+_LARGEST_STEP_RAD = 1e6
+"""Steps beyond this lead nowhere."""
+_FAR_RAD = 0.5
+"""Deflection beyond which there may be other equilibria."""
+_LAST_RESIDUAL_RAD = 1e-12
+_SAME_RAD = 1e-6
+"""Largest distance of two results that count as one equilibrium."""
 _FILES = (".yaml", ".yml")
 _HOW_TO_GIVE = "give a number for all joints, one per joint, a mapping by name, or a YAML file (.yaml) of that"
 _POSES, _TRIES = 500, 33
@@ -230,32 +238,45 @@ class PositionCompensator:
 
         Raises:
             ActionError: A wrong number of values, or one that is not finite.
-            ElasticError: The load overcomes a spring.
+            ElasticError: The load overcomes a spring: there is no equilibrium that a growing load leads to, or there
+                are several.
         """
         shown_angle = self._checked("theta", theta, "rad")
         gradient = self._compliance[:, None] * self._links.gravity_gradient(shown_angle)
+        size = gradient.ravel()
+        is_soft = size.dot(size) >= 1.0  # by the Frobenius norm, which is fast: there may be other equilibria
         gradient.flat[:: len(shown_angle) + 1] += 1.0
         # as `static_link_angle`, but by 1/K, so that a joint may be rigid, and with the gradient at θ alone, for speed;
         # the first step is Eq. 12
         factors, pivots, is_singular = _factored(gradient)
         if is_singular:
-            raise self._overcome(shown_angle, np.abs(self._links.gravity_gradient(shown_angle)).max(axis=1))
-        q, residual = shown_angle, shown_angle
+            return self._soft_link_angle(shown_angle, None)
+        q = shown_angle
         for _ in range(_MOST_ITERATIONS):
             residual = q - shown_angle + self._compliance * self._torque(q, None, None)
             step, _ = _solved(factors, pivots, residual)
             q = q - step
-            if residual.dot(residual) < _LAST_STEP_RAD**2:
-                return q
-        raise self._overcome(shown_angle, np.abs(residual))
+            missing = residual.dot(residual)
+            if missing < _LAST_STEP_RAD**2:
+                way = q - shown_angle
+                return self._soft_link_angle(shown_angle, q) if is_soft or way.dot(way) > _FAR_RAD**2 else q
+            if not missing < _LARGEST_STEP_RAD**2:
+                break
+        return self._soft_link_angle(shown_angle, None)
 
-    def _overcome(self, theta: Array, how_much: Array) -> ElasticError:
-        """The error for a spring that its load overcomes, that of the joint where it is most."""
-        worst = int(how_much.argmax())
-        return ElasticError(
-            f"no link angles for {theta} rad: Eq. 10 did not converge in {_MOST_ITERATIONS} steps; is the stiffness of "
-            f"{self.joints[worst]} ({1.0 / self._compliance[worst]:.6g} N·m/rad) too low for its load?"
+    def _soft_link_angle(self, theta: Array, guess: Array | None) -> Array:
+        """The same where the load bends a spring far: by a load that grows; the guess if it is the same pose."""
+        found = follow_load(
+            theta,
+            self._compliance,
+            lambda q: self._torque(q, None, None),
+            self._links.gravity_gradient,
+            tolerance=_LAST_RESIDUAL_RAD,
+            within=(self._lowest, self._highest),
         )
+        if found.lost.any():
+            raise ElasticError(f"no link angles for {theta} rad: {found.reason(self._compliance, self.joints)}")
+        return guess if guess is not None and np.abs(guess - found.q).max() < _SAME_RAD else found.q
 
     def _warn_of_room(self) -> None:
         """Warn where the weight at some pose within the ranges needs a larger offset than the limit."""

@@ -16,11 +16,13 @@ Survey Methodology 28(2), 2002.) Λ is the precision of the prior.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import least_squares
 
+from baselines.identification.log_signs import require_deflections_with_load, require_like_encoders, require_signs
 from baselines.identification.pose_log import Kind
 from baselines.identification.pose_model import PoseModel, measurement_unit
 from elastic_env.core.errors import ConfigurationError, ElasticError
@@ -28,8 +30,13 @@ from elastic_env.core.signals import Array, IntArray
 
 _FINEST: dict[Kind, float] = {"end_effector": 1e-4, "imu": 1e-4, "link_encoders": 1e-5, "torques": 1e-2}
 """Noise beside which the prior counts [m], [rad], [N·m]: about that of good sensors."""
+USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
+"""Noise of usual sensors [m], [rad], [N·m]."""
+FAR_BEYOND = 10.0
+"""Ratio of residuals and usual noise from which on the log does not fit the arm."""
 MOST_EVALUATIONS = 100
-"""Steps after which a fit gives up."""
+"""Steps after which a fit goes on with steps in units of the derivatives."""
+_FURTHER_EVALUATIONS = 150
 USUAL_EVALUATIONS = 12
 """Steps of a usual fit, at most."""
 
@@ -89,19 +96,51 @@ def fit_arm(model: PoseModel, progress: Callable[[int], None] | None = None) -> 
         progress: Called with the number of evaluations so far.
 
     Raises:
-        ConfigurationError: Too few poses for the unknowns.
+        ConfigurationError: Too few poses for the unknowns, or the signs of the log contradict the model.
         ElasticError: The log does not fit the arm.
     """
     require_poses(model)
+    require_like_encoders(model.log)
     finest = _FINEST[model.log.kind]
-    problem = _Problem(model, finest, progress)
+    if _spread_near(model) > FAR_BEYOND * USUAL_NOISE[model.log.kind]:
+        require_signs(model, _spread_near)
+    fit = _described(model, _solution(model, finest, progress), finest)
+    require_deflections_with_load(model, fit.unknowns, fit.estimate("compliance")[1])
+    return fit
+
+
+def _solution(model: PoseModel, noise: float, progress: Callable[[int], None] | None) -> Array:
+    """Unknowns that fit, (p,).
+
+    Raises:
+        ElasticError: There are no springs that explain the log, or they are not found.
+    """
+    problem = _Problem(model, noise, progress)
     start = model.start_with(_FIRST_DEFLECTION_RAD) / model.scale
-    found = least_squares(problem.residual, start, jac=problem.jacobian, method="trf", max_nfev=MOST_EVALUATIONS)  # type: ignore[arg-type]
+    found = _least_squares(problem, start, MOST_EVALUATIONS)
+    if not found.success:  # ill-conditioned: steps in units of the derivatives come further
+        found = _least_squares(problem, found.x, _FURTHER_EVALUATIONS, x_scale="jac")
     if not found.success:
         raise ElasticError(
-            f"the fit did not converge in {MOST_EVALUATIONS} steps; check signs, zeros and units of the log's columns"
+            f"the fit did not converge in {MOST_EVALUATIONS + _FURTHER_EVALUATIONS} steps; check zeros and units of "
+            "the log's columns and the masses of the model, or seek fewer joints by --joints"
         )
-    return _described(model, model.scale * found.x, finest)
+    return model.scale * found.x
+
+
+def _least_squares(problem: "_Problem", start: Array, evaluations: int, **options: Any) -> Any:
+    return least_squares(problem.residual, start, jac=problem.jacobian, method="trf", max_nfev=evaluations, **options)  # type: ignore[arg-type]
+
+
+def _spread_near(model: PoseModel) -> float:
+    """Spread of the residuals of poses to first order about small deflections, in the unit of the measurement."""
+    start = model.start_with(_FIRST_DEFLECTION_RAD)
+    predicted, gradient = model.predicted(start)
+    noise = _FINEST[model.log.kind]
+    rows = gradient.reshape(-1, len(start)) * model.scale / noise
+    residual = (model.target - predicted).ravel() / noise
+    step = np.linalg.solve(rows.T @ rows + np.eye(len(start)), rows.T @ residual)
+    return noise * float(np.std(residual - rows @ step))
 
 
 class _Problem:
@@ -116,13 +155,23 @@ class _Problem:
     def __init__(self, model: PoseModel, noise: float, progress: Callable[[int], None] | None) -> None:
         self._model, self._noise, self._progress = model, noise, progress
         self._count, self._at, self._gradient = 0, np.empty(0), np.empty(0)
+        self._size = model.target.size + model.unknowns.size
 
     def residual(self, x: Array) -> Array:
-        """Predicted less measured, then the prior, (N m + p,)."""
+        """Predicted less measured, then the prior, (N m + p,); infinite where a load overcomes a spring.
+
+        Raises:
+            ElasticError: It does so at the start.
+        """
         self._count += 1
         if self._progress is not None:
             self._progress(self._count)
-        predicted, self._gradient = self._model.predicted(self._model.scale * x)
+        try:
+            predicted, self._gradient = self._model.predicted(self._model.scale * x)
+        except ElasticError:
+            if not len(self._at):
+                raise
+            return np.full(self._size, np.inf)  # the solver takes a shorter step
         self._at = x.copy()
         return np.concatenate([(predicted - self._model.target).ravel() / self._noise, x])
 

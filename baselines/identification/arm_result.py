@@ -1,9 +1,11 @@
 """What an identification of an arm found, as files hold it: intervals in JSON, stiffness in YAML."""
 
+import math
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from baselines.identification.arm_fit import ArmFit
 from baselines.identification.pose_log import Kind
@@ -11,11 +13,24 @@ from baselines.identification.pose_model import SMALLEST_LOAD
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.yaml_text import yaml_line
+from elastic_env.joint.known_torque import hinges_of
 
-Source = Literal["told apart", "wide interval", "assumed"]
-"""Where the stiffness of a joint comes from: a narrow interval, as asked for, a wider one, or no bounded one."""
+Source = Literal["told apart", "wide interval", "no upper end", "rigid", "assumed"]
+"""Origin of a joint's stiffness.
 
+An estimate with a narrow interval, as asked for; with a wider one; or with one that reaches to rigid. Rigid where the
+poses say nothing of the joint, or where the estimate of 1/K is negative. Assumed where the user gave K in its place.
+"""
+
+_OFFSET_KNOWN_RAD = 0.05
+"""Half-width of an offset's interval above which the poses do not tell the offset."""
+_KNOWN = 0.5
+"""The same for friction and payload, as a share of their plausible size."""
 _SHOWN = 0.05  # of the largest derivative of the measurement by a joint: gravity couples the others by less
+UNLOADED = "gravity does not load it in these poses"
+UNSEEN = "the measurement does not show its angle"
+NEGATIVE = "stiffer than the log can tell; the estimate is negative"
 _ALIKE = 0.95  # correlation of two unknowns that the poses hardly tell apart
 
 
@@ -23,8 +38,8 @@ class JointStiffness(Model):
     """Stiffness of one joint. Intervals are of 95 %; None where they have no bound."""
 
     joint: str
-    stiffness_nm_per_rad: float
-    """What `joints.yaml` has."""
+    stiffness_nm_per_rad: float = Field(allow_inf_nan=True)
+    """Value in `joints.yaml`; infinite for a rigid joint, which JSON has as null."""
     source: Source
     stiffness_low_nm_per_rad: float | None
     stiffness_high_nm_per_rad: float | None
@@ -32,11 +47,13 @@ class JointStiffness(Model):
     """Half-width of the interval of the compliance 1/K, relative to its estimate."""
     reason: str
     """Why the poses do not tell the stiffness apart; empty where they do."""
+    is_negative: bool = False
+    """Whether the estimate of 1/K is negative: the joint is stiffer than the log can tell."""
     friction_nm: float | None
-    """Friction on the link side of the spring; None where the log has no sides of approach."""
+    """Friction on the link side of the spring; None where the poses do not tell it."""
     friction_half_width_nm: float | None
-    offset_rad: float
-    """What the motor encoder reads beyond θ."""
+    offset_rad: float | None
+    """What the motor encoder reads beyond θ; None where the poses do not tell it."""
     offset_half_width_rad: float
     largest_torque_nm: float
     """Largest gravity torque in the poses."""
@@ -53,24 +70,32 @@ class ArmIdentification(Model):
     """Half-width up to which a joint counts as told apart."""
     joints: tuple[JointStiffness, ...]
     payload_kg: float | None
+    """Mass of the payload; None where it is not sought, or where the poses do not tell it."""
     payload_half_width_kg: float | None
     residual_spread: float
     """Standard deviation of the residuals [m], [rad] or [N·m]."""
     friction_is_noise: bool
     """Whether the log has no sides of approach, so that friction widens the intervals."""
+    rigid_joints: tuple[str, ...] = ()
+    """Joints of the log that were taken as rigid."""
+    held_joints: tuple[str, ...] = ()
+    """Hinges of the model that the log does not have: they were held."""
     outlying_poses: tuple[int, ...]
     """Poses of the log, counted from 1, whose residual is far beyond the others'."""
 
     def stiffness(self) -> dict[str, dict[str, float]]:
         """A mapping as `PositionCompensator` and the environments take it."""
-        return {joint.joint: {"stiffness": joint.stiffness_nm_per_rad} for joint in self.joints}
+        return {joint.joint: {"stiffness": _written(joint)} for joint in self.joints}
 
     def save(self, folder: Path) -> list[Path]:
         """Write `identification.json` and `joints.yaml`."""
         files = [folder / "identification.json", folder / "joints.yaml"]
         files[0].write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        lines = [_yaml_line(joint) for joint in self.joints]
-        files[1].write_text("\n".join(["# stiffness [N·m/rad], by elastic identify", *lines]) + "\n", encoding="utf-8")
+        head = "# stiffness [N·m/rad], by elastic identify; .inf for a rigid joint"
+        lines = [yaml_line(joint.joint, {"stiffness": _written(joint)}, _comment(joint)) for joint in self.joints]
+        lines += [yaml_line(name, {"stiffness": math.inf}, "rigid: not sought") for name in self.rigid_joints]
+        lines += [yaml_line(name, "held", "not in the log") for name in self.held_joints]
+        files[1].write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
         return files
 
 
@@ -80,31 +105,37 @@ def described(fit: ArmFit, within: float, assumed: float | None, planned: Array 
     Args:
         fit: The fit.
         within: Largest half-width of 1/K, relative, of a joint that counts as told apart.
-        assumed: K of joints of which the interval of 1/K holds zero; None for the largest K that was identified.
+        assumed: K of joints whose interval of 1/K holds zero; None for their own estimate, or rigid.
         planned: Information with the proposed poses, (p, p); None without a plan.
 
     Raises:
         ConfigurationError: No joint is identified and no stiffness is assumed.
     """
     compliance, half = fit.estimate("compliance")
-    known = compliance > half
-    if assumed is None:
-        if not known.any():
-            raise ConfigurationError(
-                "the poses tell no stiffness: the interval of every joint reaches to rigid; log poses with larger "
-                "gravity torques (--plan proposes them), or a finer measurement"
-            )
-        assumed = float((1.0 / compliance[known]).max())
-    why, after = reasons(fit, within), None if planned is None else expected_half_width(fit, planned)
+    if assumed is None and not (compliance > half).any():
+        raise ConfigurationError(
+            "the poses tell no stiffness: the interval of every joint reaches to rigid; log poses with larger "
+            "gravity torques (--plan proposes them), or a finer measurement"
+        )
+    why = reasons(fit, within)
+    after = None if planned is None else expected_half_width(fit, planned)
     joints = tuple(_joint(fit, i, within, assumed, why[i], after) for i in range(len(compliance)))
-    payload, payload_half = fit.estimate("payload")
+    payload, payload_half = _first_known(fit, "payload")
+    log = fit.model.log
+    sought = [joint.joint for joint in joints]
     return ArmIdentification(
-        measurement=fit.model.log.kind, poses=len(fit.q), within=within, joints=joints,
-        payload_kg=float(payload[0]) if len(payload) else None,
-        payload_half_width_kg=float(payload_half[0]) if len(payload) else None,
-        residual_spread=fit.spread, friction_is_noise=fit.model.log.direction is None,
+        measurement=log.kind,
+        poses=len(fit.q),
+        within=within,
+        joints=joints,
+        payload_kg=payload,
+        payload_half_width_kg=payload_half,
+        residual_spread=fit.spread,
+        friction_is_noise=log.direction is None,
+        rigid_joints=tuple(joint for joint in log.joints if joint not in sought),
+        held_joints=tuple(joint for joint in hinges_of(fit.model.arm.model) if joint not in log.joints),
         outlying_poses=tuple(int(pose) + 1 for pose in fit.outliers),
-    )  # fmt: skip
+    )
 
 
 def expected_half_width(fit: ArmFit, information: Array) -> Array:
@@ -124,9 +155,9 @@ def reasons(fit: ArmFit, within: float) -> list[str]:
         if half[i] <= within * compliance[i]:
             return ""
         if unloaded[i]:
-            return "gravity does not load it in these poses"
+            return UNLOADED
         if unseen[i]:
-            return "the measurement does not show its angle"
+            return UNSEEN
         others = [names[j] for j in np.flatnonzero(alike[i] & ~unloaded)]
         if others:
             return f"these poses do not separate it from {', '.join(others)}"
@@ -155,31 +186,87 @@ def _alike(fit: ArmFit) -> BoolArray:
     return (np.abs(correlation) > _ALIKE) & ~np.eye(len(spread), dtype=bool)
 
 
-def _joint(fit: ArmFit, i: int, within: float, assumed: float, why: str, planned: Array | None) -> JointStiffness:
-    (compliance, half), (offset, offset_half) = fit.estimate("compliance"), fit.estimate("offset")
-    friction, friction_half = fit.estimate("friction")
-    is_known, c, h = compliance[i] > half[i], float(compliance[i]), float(half[i])
-    source: Source = "assumed" if not is_known else "told apart" if h <= within * c else "wide interval"
+def _joint(
+    fit: ArmFit, i: int, within: float, assumed: float | None, why: str, planned: Array | None
+) -> JointStiffness:
+    compliance, half = fit.estimate("compliance")
+    c = float(compliance[i])
+    h = float(half[i])
+    best = float(bounded_compliance(fit)[i])
+    offset, offset_half = fit.estimate("offset")
+    friction, friction_half = _first_known(fit, "friction", i)
+    is_shown = why not in (UNLOADED, UNSEEN)
+    source = _source(c, h, within, is_rigid=best == 0.0 or not is_shown, assumed=assumed)
+    stiffness = math.inf if source == "rigid" else 1.0 / best if assumed is None or c > h else assumed
     return JointStiffness(
         joint=fit.model.log.joints[fit.model.unknowns.elastic[i]],
-        stiffness_nm_per_rad=1.0 / c if is_known else assumed, source=source,
+        stiffness_nm_per_rad=stiffness,
+        source=source,
         stiffness_low_nm_per_rad=1.0 / (c + h) if c + h > 0.0 else None,
-        stiffness_high_nm_per_rad=1.0 / (c - h) if is_known else None,
-        half_width=h / max(abs(c), 1e-12), reason=why,
-        friction_nm=float(friction[i]) if len(friction) else None,
-        friction_half_width_nm=float(friction_half[i]) if len(friction) else None,
-        offset_rad=float(offset[i]), offset_half_width_rad=float(offset_half[i]),
+        stiffness_high_nm_per_rad=1.0 / (c - h) if c > h else None,
+        half_width=h / max(abs(c), 1e-12),
+        reason=why,
+        is_negative=is_shown and best == 0.0,
+        friction_nm=friction,
+        friction_half_width_nm=friction_half,
+        offset_rad=float(offset[i]) if offset_half[i] < _OFFSET_KNOWN_RAD else None,
+        offset_half_width_rad=float(offset_half[i]),
         largest_torque_nm=float(fit.model.load[i]),
         planned_half_width=None if planned is None else float(planned[i]),
-    )  # fmt: skip
+    )
 
 
-def _yaml_line(joint: JointStiffness) -> str:
-    """A joint of `joints.yaml`, with where its stiffness comes from."""
+def _source(c: float, h: float, within: float, *, is_rigid: bool, assumed: float | None) -> Source:
+    """Origin of the stiffness of a joint with the compliance c and the half-width h of its interval."""
+    if c > h and not is_rigid:
+        return "told apart" if h <= within * c else "wide interval"
+    if assumed is not None:
+        return "assumed"
+    return "rigid" if is_rigid else "no upper end"
+
+
+def bounded_compliance(fit: ArmFit) -> Array:
+    """Compliances that fit best among those that are not negative, (k,) [rad/(N·m)].
+
+    To first order: where an estimate is negative it becomes zero, and the others take over what it explained.
+    """
+    compliance, _ = fit.estimate("compliance")
+    own = fit.model.unknowns.slices["compliance"]
+    size = fit.model.scale[own]
+    spread = np.linalg.inv(fit.information)[own, own]
+    best = compliance / size
+    zero = np.zeros(len(best), dtype=np.bool_)
+    while (best < 0.0).any():
+        zero |= best < 0.0
+        taken = np.linalg.solve(spread[np.ix_(zero, zero)], compliance[zero] / size[zero])
+        best = compliance / size - spread[:, zero] @ taken
+        best[zero] = 0.0
+    return compliance if not zero.any() else best * size
+
+
+def _first_known(fit: ArmFit, name: str, i: int = 0) -> tuple[float | None, float | None]:
+    """An estimate, None where the poses do not tell it, and its half-width, None where it is not sought."""
+    values, half = fit.estimate(name)
+    if not len(values):
+        return None, None
+    size = fit.model.scale[fit.model.unknowns.slices[name]]
+    is_known = half[i] < _KNOWN * size[i]
+    return float(values[i]) if is_known else None, float(half[i])
+
+
+def _written(joint: JointStiffness) -> float:
+    """K as `joints.yaml` has it: six digits, infinite for a rigid joint [N·m/rad]."""
+    return float(f"{joint.stiffness_nm_per_rad:.6g}")
+
+
+def _comment(joint: JointStiffness) -> str:
+    """How well the stiffness of a joint is known."""
+    width = f"± {100 * joint.half_width:.2g} %"
     says = {
-        "told apart": f"± {100 * joint.half_width:.2g} %",
-        "wide interval": f"± {100 * joint.half_width:.2g} %: {joint.reason}",
+        "told apart": width,
+        "wide interval": f"{width}: {joint.reason}",
+        "no upper end": f"own estimate, may be rigid: {joint.reason}",
+        "rigid": f"rigid: {NEGATIVE if joint.is_negative else joint.reason}",
         "assumed": f"assumed, not identified: {joint.reason}",
-    }[joint.source]
-    name = joint.joint if joint.joint.replace("_", "").isalnum() else f'"{joint.joint}"'
-    return f"{name}: {{stiffness: {joint.stiffness_nm_per_rad:.6g}}}  # {says}"
+    }
+    return says[joint.source]

@@ -13,7 +13,8 @@ from typing import Literal, NoReturn
 
 import numpy as np
 
-from elastic_env.core.errors import ConfigurationError, shortened, shown, unknown_name
+from elastic_env.core.csv_table import read_table
+from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array
 
 Kind = Literal["link_encoders", "end_effector", "imu", "torques"]
@@ -32,7 +33,6 @@ UNITS = {"theta": "rad", "direction": "1", **{name: unit for name, (_, unit) in 
 MOST_POSES = 10_000
 """Rows of a log."""
 
-_LARGEST_BYTES = 50_000_000
 _HEADER = re.compile(r"^\s*([^\s.\[\]]+)\.(.+?)\s*(?:\[\s*([^\]]*?)\s*\])?\s*$")
 _SPELT = {"Nm": "N·m", "N*m": "N·m", "N m": "N·m", "": "1", "-": "1"}
 _BEYOND_RAD = 0.5  # homing errors and bent joints may exceed the range of the model by less
@@ -142,31 +142,13 @@ def write_poses(path: Path, columns: Mapping[str, Array]) -> Path:
 
 def _columns(path: Path) -> dict[str, Array]:
     """All columns of the file by their names without units."""
-    rows = _rows(path)
-    if not rows:
-        raise ConfigurationError(f"{path} is empty; its first line must name columns such as theta.JOINT [rad]")
-    names, given = [_name(path, text) for text in rows[0]], rows[1:]
+    table = read_table(
+        path, what="log", row="pose", most_rows=MOST_POSES, example="theta.JOINT [rad] and q.JOINT [rad]"
+    )
+    names = [_name(path, text) for text in table.names]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigurationError(f"{path} has the column {twice[0]} twice; keep one of them")
-    if not 0 < len(given) <= MOST_POSES:
-        raise ConfigurationError(f"{path} must have 1 to {MOST_POSES} poses, a line each, it has {len(given)}")
-    values = np.array([_numbers(path, line, names, row) for line, row in enumerate(given, start=2)])
-    return dict(zip(names, values.T, strict=True))
-
-
-def _rows(path: Path) -> list[list[str]]:
-    """Lines of the file that are not empty."""
-    if not path.is_file():
-        raise ConfigurationError(
-            f"no log at {shortened(path)}; give a CSV file of static poses, see docs/identification.md"
-        )
-    if path.stat().st_size > _LARGEST_BYTES:
-        raise ConfigurationError(f"{path} must have at most {_LARGEST_BYTES} bytes, it has {path.stat().st_size}")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        raise ConfigurationError(f"{path} is no CSV file in UTF-8: {error}") from None
+    return dict(zip(names, table.values.T, strict=True))
 
 
 def _name(path: Path, text: str) -> str:
@@ -180,30 +162,10 @@ def _name(path: Path, text: str) -> str:
     quantity, of, unit = found[1], found[2], found[3]
     if unit is not None and _SPELT.get(unit, unit) != UNITS[quantity]:
         raise ConfigurationError(
-            f"{path}, column {quantity}.{of}: the unit must be [{UNITS[quantity]}], got [{unit}]; convert the column"
+            f"{path}, column {quantity}.{shown(of)[1:-1]}: the unit must be [{UNITS[quantity]}], got "
+            f"[{shown(unit)[1:-1]}]; convert the column"
         )
     return f"{quantity}.{of}"
-
-
-def _numbers(path: Path, line: int, names: Sequence[str], row: Sequence[str]) -> list[float]:
-    """Finite numbers of a line."""
-    if len(row) != len(names):
-        raise ConfigurationError(
-            f"{path}, pose {line - 1}: {len(names)} values are needed, one a column, got {len(row)}"
-        )
-    values = []
-    for name, text in zip(names, row, strict=True):
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ConfigurationError(
-                f"{path}, pose {line - 1}, column {name}: a finite number [{UNITS[name.split('.', 1)[0]]}] is needed, "
-                f"got {shown(text)}; measure the pose again or delete its line"
-            )
-        values.append(value)
-    return values
 
 
 def _table(columns: Mapping[str, Array], quantity: str, of: Iterable[str]) -> Array:

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from baselines.identification.pose_log import Kind, PoseLog
 from baselines.identification.static_arm import StaticArm
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import Array, IntArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
+from elastic_env.joint.load_path import follow_load
 
 Frame = Literal["known", "offset", "pose"]
 """What is known of the measurement's frame: all, its directions, or nothing."""
@@ -35,6 +36,12 @@ SMALLEST_LOAD = 1e-3
 
 _PRIOR = {"offset": 0.3, "payload_kg": 10.0, "translation_m": 1.0, "rotation_rad": 0.3}
 _FIRST_ITERATIONS, _MOST_ITERATIONS, _LAST_STEP_RAD = 6, 50, 1e-12
+_SOFT = 0.5
+"""Change of the deflection by that of the link angle from which on the load is followed."""
+_FINEST_STEP = 0.05
+"""Share of the load in a step of a path, at least."""
+_FARTHEST_RAD = 1e3
+"""Deflections beyond this are none."""
 
 
 @dataclass(frozen=True)
@@ -166,23 +173,49 @@ class PoseModel:
         """
         theta = self.log.theta - self.expand(unknowns, "offset")
         compliance = self.expand(unknowns, "compliance")
+        one = np.eye(len(compliance))
         q = theta
-        for _ in range(
-            _FIRST_ITERATIONS
-        ):  # shrink the error by about τ′/K each, so that derivatives are taken in place
+        # these shrink the error by about τ′/K each, so that derivatives are taken in place
+        for _ in range(_FIRST_ITERATIONS):
             q = theta - compliance * self.torque(unknowns, q)
-        gradient = self.arm.torque_gradient(q, self.payload_kg(unknowns))
-        inverse = np.linalg.inv(np.eye(len(compliance)) + compliance[:, None] * gradient)
-        for _ in range(_MOST_ITERATIONS):
+            q = np.where(np.abs(q - theta) < _FARTHEST_RAD, q, theta)
+        bend = compliance[:, None] * self.arm.torque_gradient(q, self.payload_kg(unknowns))
+        is_soft = np.abs(bend).sum(axis=-1).max(axis=-1)[:, None] >= _SOFT
+        inverse = np.linalg.inv(one + np.where(is_soft[..., None], 0.0, bend))
+        is_open = ~is_soft.all()
+        for _ in range(_MOST_ITERATIONS if is_open else 0):
             step = inverse @ (q - theta + compliance * self.torque(unknowns, q))[..., None]
-            q = q - step[..., 0]
-            if not np.abs(step).max() > _LAST_STEP_RAD:
-                return q, inverse
-        raise ElasticError(
-            "no link angles for these poses: gravity overcomes the springs that the log implies; check signs, zeros, "
-            "units and frame (--frame) of its columns, the point that was measured (--end-effector), and the masses of "
-            "the model"
+            q = np.where(is_soft, q, q - step[..., 0])
+            if not np.abs(step[~is_soft[:, 0]]).max() > _LAST_STEP_RAD:
+                is_open = False
+                break
+        if not is_open and not is_soft.any():
+            return q, inverse
+        followed = is_soft | is_open
+        q = np.where(followed, self._followed(unknowns, theta, compliance, followed), q)
+        bend = compliance[:, None] * self.arm.torque_gradient(q, self.payload_kg(unknowns))
+        return q, np.where(followed[..., None], np.linalg.inv(one + bend), inverse)
+
+    def _followed(self, unknowns: Array, theta: Array, compliance: Array, rows: BoolArray) -> Array:
+        """Link angles on soft springs, by a load that grows, (N, n) [rad]."""
+        path = follow_load(
+            theta,
+            compliance,
+            lambda q: self.torque(unknowns, q),
+            lambda q: self.arm.torque_gradient(q, self.payload_kg(unknowns)),
+            tolerance=_LAST_STEP_RAD,
+            rows=rows,
+            unique=False,
+            finest=_FINEST_STEP,
         )
+        if path.lost.any():
+            pose = int(path.lost[:, 0].argmax()) + 1
+            raise ElasticError(
+                f"no link angles for pose {pose}: {path.reason(compliance, self.log.joints)}. Check zeros, units and "
+                "frame (--frame) of the log's columns, the point that was measured (--end-effector), and the masses of "
+                "the model"
+            )
+        return path.q
 
     def predicted(self, unknowns: Array) -> tuple[Array, Array]:
         """Measurements, (N, m), and their derivatives by the unknowns, (N, m, p)."""

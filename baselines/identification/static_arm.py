@@ -64,9 +64,13 @@ class StaticArm:
             self._data.qpos[:] = model.key_qpos[0]
         self._at = np.array([model.joint(joint).qposadr[0] for joint in joints])
         self._dofs = np.array([model.joint(joint).dofadr[0] for joint in joints])
-        self.end_effector = _outermost(model) if end_effector is None else end_effector
-        self._body, self._point = _place(model, self.end_effector)
-        self._turn = _turn(model, self.end_effector)
+        self._body, self._point = _outermost(model), np.zeros(3)
+        self._turn = np.eye(3)
+        self.end_effector = model.body(self._body).name or f"body {self._body}"
+        if end_effector is not None:
+            self.end_effector = end_effector
+            self._body, self._point = _place(model, end_effector)
+            self._turn = _turn(model, end_effector)
         at = [int(model.joint(name).id) for name in joints]
         limited = model.jnt_limited[at].astype(bool)[:, None]
         self.ranges = np.where(limited, model.jnt_range[at], [-np.inf, np.inf])
@@ -121,7 +125,8 @@ class StaticArm:
 
 
 def _rows(compensator: PositionCompensator, q: Array) -> Array:
-    return np.array([compensator.torque(row) for row in q])
+    """Torques at rest of all poses at once, with the bits of `PositionCompensator.torque`, (N, n) [N·m]."""
+    return compensator._links.gravity_torque(q)
 
 
 def _sites(model: mujoco.MjModel) -> list[str]:
@@ -150,9 +155,9 @@ def _turn(model: mujoco.MjModel, name: str) -> Array:
     return turn.reshape(3, 3)
 
 
-def _outermost(model: mujoco.MjModel) -> str:
+def _outermost(model: mujoco.MjModel) -> int:
     """The body with the most bodies between it and the base, the last one of several."""
     depth = np.zeros(model.nbody, dtype=np.int64)
     for body in range(1, model.nbody):
         depth[body] = depth[model.body_parentid[body]] + 1
-    return model.body(int(model.nbody - 1 - depth[::-1].argmax())).name
+    return int(model.nbody - 1 - depth[::-1].argmax())

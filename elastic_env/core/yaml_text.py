@@ -1,5 +1,7 @@
 """YAML as configurations need it: plain data of bounded size, and nothing that YAML 1.1 makes of text.
 
+What `yaml_of` and `yaml_line` write, `parse_yaml` reads.
+
 The limits hold before anything is built, so that a small file cannot ask for much memory.
 """
 
@@ -18,6 +20,7 @@ MOST_VALUES = 20_000
 LONGEST_NUMBER = 40
 """Characters of a number."""
 
+_NO_FOLDING = 10**9  # characters of a line
 _TAG = "tag:yaml.org,2002:"
 _EXPONENT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
 NO_TEXT = re.compile("[\x00\ud800-\udfff]")
@@ -118,6 +121,37 @@ def _with_quotes(text: str, error: yaml.MarkedYAMLError) -> yaml.MarkedYAMLError
             value = "" if found["value"] is None else f": {found['value'].strip()[:40]}"
             return _refusal_at(mark, f'put the pattern in quotes: "{key}"{value}')
     return error
+
+
+class _Dumper(yaml.SafeDumper):
+    """PyYAML's, with quotes around text that `parse_yaml` would read as a number, such as 1e3, or would fold."""
+
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        """Text; with escapes where it holds line ends or other characters that do not print."""
+        return self.represent_scalar(f"{_TAG}str", text, style=None if text.isprintable() else '"')
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+_Dumper.add_implicit_resolver(f"{_TAG}float", _EXPONENT, list("-+.0123456789"))
+
+
+def yaml_of(content: Any) -> str:
+    """Plain data as YAML that `parse_yaml` reads: mappings with text as keys, lists, text, numbers and the like."""
+    return yaml.dump(content, Dumper=_Dumper, allow_unicode=True, sort_keys=False)
+
+
+def yaml_line(name: str, value: Any, comment: str) -> str:
+    """An entry of a mapping with a comment behind it, on a line of its own; a long name takes two lines.
+
+    Args:
+        name: Key of the entry, any text that a file can hold.
+        value: Plain data without a mapping or list in it that holds another one.
+        comment: Its characters that do not print become spaces.
+    """
+    flow = None if isinstance(value, dict | list) else False  # None: only what holds no mapping or list
+    text = yaml.dump({name: value}, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=_NO_FOLDING)
+    printed = "".join(char if char.isprintable() else " " for char in comment)
+    return f"{text.rstrip()}  # {printed}"
 
 
 def _require_plain(event: Any) -> None:

@@ -10,7 +10,6 @@ joint, one robot and a batch of robots are the same formula.
 Eq. n: the paper that this project reproduces (see the README).
 """
 
-from collections.abc import Callable
 from typing import Self
 
 import numpy as np
@@ -18,9 +17,17 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import Array, Parameter
+from elastic_env.core.signals import Array, BoolArray, Parameter
+from elastic_env.joint.load_path import TorqueFunction, follow_load
 
-TorqueFunction = Callable[[Array], Array]
+_SINGULAR = float(np.finfo(np.float64).eps)
+"""Determinant below which a matrix counts as singular."""
+_SAME_RAD = 1e-6
+"""Largest distance of two results that count as one equilibrium."""
+_FAR_RAD = 0.5
+"""Deflection beyond which there may be other equilibria."""
+_LARGEST_STEP_RAD = 1e6
+"""Newton steps beyond this lead nowhere."""
 
 
 class Servo(Model):
@@ -121,8 +128,12 @@ def static_link_angle(
     torque_gradient: TorqueFunction,
     tolerance: float = 1e-12,
     max_iterations: int = 50,
+    unique: bool = True,
 ) -> Array:
     r"""Link angle at rest for a motor angle: Eq. 10, q = θ − K⁻¹ τ_g(q), by Newton-Raphson from q = θ.
+
+    Where the load bends a spring far, Newton's steps may fail or end at another equilibrium. There the load grows from
+    zero, see `follow_load`.
 
     Args:
         theta: Motor side, (..., n) [rad].
@@ -130,28 +141,46 @@ def static_link_angle(
         torque: τ_g(q), from (..., n) to (..., n) [N·m].
         torque_gradient: ∂τ_g/∂q, from (..., n) to (..., n, n) [N·m/rad].
         tolerance: Largest residual of Eq. 10 that is accepted [rad].
-        max_iterations: Newton steps before giving up.
+        max_iterations: Newton steps before the load is followed.
+        unique: Whether an equilibrium on a soft spring must be the only one. If not, the one that a growing load leads
+            to is taken.
 
     Returns:
         q, (..., n) [rad].
 
     Raises:
-        ElasticError: No convergence, as happens where gravity overcomes the spring (K + ∂τ_g/∂q singular).
+        ElasticError: The load overcomes a spring: there is no equilibrium that a growing load leads to, or there are
+            several.
     """
     K = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), theta.shape)
     q = np.array(theta, dtype=np.float64)
+    is_soft = np.zeros((*theta.shape[:-1], 1), dtype=np.bool_)
+    open_rows = ~is_soft
     residual = np.full_like(q, np.inf)
-    for _ in range(max_iterations):
+    for iteration in range(max_iterations):
         residual = K * (q - theta) + torque(q)
-        open_rows = np.any(np.abs(residual) > tolerance * K, axis=-1, keepdims=True)
-        if not open_rows.any():
-            return q
+        open_rows = open_rows & np.any(np.abs(residual) > tolerance * K, axis=-1, keepdims=True)
+        if iteration and not open_rows.any():
+            break
         # rows that are done stay, so that a row does not depend on the rest of its batch
-        q = np.where(open_rows, q - solve_stiffness(K, torque_gradient(q), residual), q)
-    raise ElasticError(
-        f"Eq. 10 did not converge in {max_iterations} Newton steps: residual {np.abs(residual / K).max():.3g} rad, "
-        f"required {tolerance:.3g} rad; is the stiffness (smallest {K.min():.6g} N·m/rad) too low for the load?"
-    )
+        gradient = torque_gradient(q) / K[..., None]
+        step, is_singular = _solved(gradient, residual / K)
+        is_lost = is_singular | ~(np.abs(step) < _LARGEST_STEP_RAD).all(axis=-1, keepdims=True)
+        is_soft = is_soft | ((open_rows | (iteration == 0)) & _may_fold(gradient)) | (open_rows & is_lost)
+        open_rows = open_rows & ~is_lost
+        q = np.where(open_rows, q - step, q)
+    is_soft = is_soft | open_rows | (np.abs(q - theta).max(axis=-1, keepdims=True) > _FAR_RAD)
+    if not is_soft.any():
+        return q
+    found = follow_load(theta, 1.0 / K, torque, torque_gradient, tolerance=tolerance, rows=is_soft, unique=unique)
+    if (lost := found.lost).any():
+        worst = float(np.abs(residual / K)[lost[..., 0]].max())
+        raise ElasticError(
+            f"Eq. 10 did not converge in {max_iterations} Newton steps: residual {worst:.3g} rad, required "
+            f"{tolerance:.3g} rad; {found.reason(1.0 / K)}"
+        )
+    is_same = ~open_rows & (np.abs(found.q - q).max(axis=-1, keepdims=True) < _SAME_RAD)
+    return np.where(is_soft & ~is_same, found.q, q)
 
 
 def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> Array:
@@ -168,24 +197,45 @@ def solve_stiffness(stiffness: Array, torque_gradient: Array, torque: Array) -> 
     Raises:
         ElasticError: K + ∂τ_g/∂q is singular: gravity balances the spring and no deflection is stable.
     """
-    n = stiffness.shape[-1]
     # every row by its own stiffness: the size of K says nothing about singularity
-    relative = torque_gradient / stiffness[..., None] + np.eye(n)
-    if n == 1:
-        _require_regular(relative[..., 0, 0], stiffness)
-        return torque / stiffness / relative[..., 0]
-    try:
-        solution = np.linalg.solve(relative, (torque / stiffness)[..., None])[..., 0]
-    except np.linalg.LinAlgError:
-        solution = np.full_like(torque, np.inf)
-    if not (np.abs(solution) < np.pi).all():  # no deflection: worth a closer look
-        _require_regular(np.linalg.det(relative), stiffness)
-    return solution
-
-
-def _require_regular(determinant: Array, stiffness: Array) -> None:
-    if (np.abs(determinant) < np.finfo(np.float64).eps).any():
+    solution, is_singular = _solved(torque_gradient / stiffness[..., None], torque / stiffness)
+    if is_singular.any():
         raise ElasticError(
             "K + ∂τ_g/∂q is singular: gravity cancels the stiffness "
             f"(smallest K {stiffness.min():.6g} N·m/rad); a stiffer joint or a lighter load is needed"
         )
+    return solution
+
+
+def _solved(relative_gradient: Array, right: Array) -> tuple[Array, BoolArray]:
+    """Solve (1 + K⁻¹ ∂τ_g/∂q) x = K⁻¹ τ row by row.
+
+    Args:
+        relative_gradient: K⁻¹ ∂τ_g/∂q, (..., n, n).
+        right: K⁻¹ τ, (..., n) [rad].
+
+    Returns:
+        x, (..., n) [rad], and rows whose matrix is singular, (..., 1).
+    """
+    n = right.shape[-1]
+    matrix = relative_gradient + np.eye(n)
+    if n == 1:
+        is_singular = np.abs(matrix[..., 0]) < _SINGULAR
+        return right / np.where(is_singular, 1.0, matrix[..., 0]), is_singular
+    try:
+        solution = np.linalg.solve(matrix, right[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        is_zero = np.linalg.det(matrix)[..., None] == 0.0
+        solution = np.linalg.solve(np.where(is_zero[..., None], np.eye(n), matrix), right[..., None])[..., 0]
+        solution = np.where(is_zero, np.inf, solution)
+    is_large: BoolArray = ~np.all(np.abs(solution) < np.pi, axis=-1, keepdims=True)
+    if not is_large.any():
+        return solution, is_large
+    # no deflection: worth a closer look
+    is_singular: BoolArray = is_large & (np.abs(np.linalg.det(matrix))[..., None] < _SINGULAR)
+    return solution, is_singular
+
+
+def _may_fold(relative_gradient: Array) -> BoolArray:
+    """Rows whose load may overcome a spring: K⁻¹ ∂τ_g/∂q is not smaller than 1, (..., 1)."""
+    return np.asarray(np.abs(relative_gradient).sum(axis=-1).max(axis=-1, keepdims=True) >= 1.0)

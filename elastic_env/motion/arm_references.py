@@ -4,7 +4,6 @@ Those of `elastic_env.motion.references` move every joint alike. These know the 
 where its end effector is. All begin with a second of standing.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
@@ -14,7 +13,8 @@ from pydantic import Field
 from scipy.interpolate import CubicSpline
 
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity
-from elastic_env.core.errors import ConfigurationError, require_known, shortened, shown, unknown_name
+from elastic_env.core.csv_table import read_table
+from elastic_env.core.errors import ConfigurationError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.motion.inverse_kinematics import joint_path
@@ -22,7 +22,10 @@ from elastic_env.motion.references import REFERENCES, AboutHome, Hold, Multisine
 from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
 
 _TRIES = 1000
-_LARGEST_BYTES, _LONGEST_S = 20_000_000, 7200.0
+_LONGEST_S = 7200.0
+_SHORTEST_S = 1e-6
+_LARGEST_RAD = 1e4
+_MOST_ROWS = 2_000_000
 _HALF_TURN = np.pi / 2
 _MARGIN = 0.1
 """Share of a joint's range that drawn poses keep from either end."""
@@ -279,26 +282,20 @@ def _table(file: Path, joints: tuple[str, ...]) -> tuple[list[str], Array]:
     Raises:
         ConfigurationError: It cannot be read, or a column or value is not what it has to be.
     """
-    if not file.is_file():
-        raise ConfigurationError(
-            f"no file of angles at {shortened(file)}; give a CSV file with the column time_s and joints"
-        )
-    if file.stat().st_size > _LARGEST_BYTES:
-        raise ConfigurationError(f"{file} must have at most {_LARGEST_BYTES} bytes, it has {file.stat().st_size}")
-    try:
-        head, *lines = [line for line in csv.reader(file.read_text(encoding="utf-8").splitlines()) if line]
-        rows = np.array(lines, dtype=np.float64)
-    except (ValueError, csv.Error) as error:
-        raise ConfigurationError(f"{file} must hold a head and rows of numbers, as many as columns: {error}") from None
-    names = [name.strip() for name in head]
+    table = read_table(file, what="file of angles", row="row", most_rows=_MOST_ROWS, example="time_s, then joints")
+    names, rows = table.names, table.values
     if names[0] != "time_s":
         raise ConfigurationError(f"the first column of {file} must be time_s, got {shown(names[0])}")
     require_known(f"column of {file}", names[1:], joints)
-    if len(rows) < 2 or len(names) < 2 or len(set(names)) < len(names) or not np.isfinite(rows).all():
-        raise ConfigurationError(f"{file} must have two rows or more, and finite angles of joints, each joint once")
+    if len(rows) < 2 or len(names) < 2:
+        raise ConfigurationError(f"{file} must have two rows or more, and a column of angles or more beside time_s")
     if (np.diff(rows[:, 0]) <= 0.0).any() or rows[-1, 0] - rows[0, 0] > _LONGEST_S:
         raise ConfigurationError(f"time_s of {file} must increase from row to row, over at most {_LONGEST_S:g} s")
-    return names[1:], rows
+    if np.diff(rows[:, 0]).min() < _SHORTEST_S or np.abs(rows[:, 1:]).max() > _LARGEST_RAD:
+        raise ConfigurationError(
+            f"{file} must have rows at least {_SHORTEST_S:g} s apart, and angles within ±{_LARGEST_RAD:g} rad"
+        )
+    return list(names[1:]), rows
 
 
 def _moved(visits: Array, share: Array, move_s: float) -> tuple[Array, Array, Array]:

@@ -359,4 +359,4 @@ def _rest_angle(command: Array, factor: Parameter = 1.0, *, form: str, true: Rob
         return command
     engaged = command - np.sign(body.gravity_torque(command)) * true.backlash / 2.0
     finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
-    return static_link_angle(engaged, finite, body.gravity_torque, body.gravity_gradient)
+    return static_link_angle(engaged, finite, body.gravity_torque, body.gravity_gradient, unique=False)

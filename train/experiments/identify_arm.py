@@ -14,8 +14,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from baselines.identification.arm_fit import USUAL_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
-from baselines.identification.arm_result import ArmIdentification, JointStiffness, described
+from baselines.identification.arm_fit import (
+    FAR_BEYOND,
+    USUAL_EVALUATIONS,
+    USUAL_NOISE,
+    fit_arm,
+    in_unit,
+    require_poses,
+    summed_up,
+)
+from baselines.identification.arm_result import NEGATIVE, ArmIdentification, JointStiffness, Source, described
 from baselines.identification.pose_log import Kind, PoseLog, read_log, write_poses
 from baselines.identification.pose_model import Frame, PoseModel, Unknowns
 from baselines.identification.pose_plan import (
@@ -36,10 +44,6 @@ from train.figures.arm_plots import draw_arm_identification
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
-_USUAL_NOISE: dict[Kind, float] = {"end_effector": 3e-4, "imu": 1e-3, "link_encoders": 1e-4, "torques": 0.1}
-"""Noise of usual sensors, which a plan without a log assumes [m], [rad], [N·m]."""
-_FAR_BEYOND = 10.0
-"""Ratio of residuals and usual noise from which on the output warns."""
 _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
@@ -62,7 +66,7 @@ class IdentifyArmConfig(Model):
     measured_by: Kind | None = None
     """Measurement to use."""
     within: float = quantity("1", 0.03, gt=0, lt=1, description="half-width of 1/K up to which a joint is told apart")
-    assume: float | None = quantity("N·m/rad", None, gt=0, description="K of joints that are not identified")
+    assume: float | None = quantity("N·m/rad", None, gt=0, description="K of joints whose interval reaches to rigid")
     plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED, description="number of poses to propose")
     seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the poses from which the plan chooses")
 
@@ -121,7 +125,7 @@ def run_arm_identification(
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
         files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
     console.print(result_table(result))
-    for line in [summed_up(fit), *remarks(result, fit)]:
+    for line in [summed_up(fit), *remarks(result)]:
         console.print(line, highlight=False, markup=False)
     for path in files:
         console.print(f"wrote {path}", soft_wrap=True, markup=False)
@@ -139,38 +143,61 @@ def result_table(result: ArmIdentification) -> Table:
         table.add_column(escape(head), justify="right", no_wrap=True)
     for joint in result.joints:
         cells = [*_stiffness_cells(joint), *[_percent(joint.planned_half_width)] * has_plan]
-        cells += [_number(joint.friction_nm)] * has_friction + [_number(1e3 * joint.offset_rad)]
+        cells += [_number(joint.friction_nm)] * has_friction + [_number(joint.offset_rad, 1e3)]
         table.add_row(escape(joint.joint), *cells)
     return table
 
 
-def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
+def remarks(result: ArmIdentification) -> list[str]:
     """What the table does not say: the payload, joints that are not told apart, and poses that do not fit."""
     lines = []
-    if result.payload_kg is not None and result.payload_half_width_kg is not None:
-        lines.append(f"payload {result.payload_kg:.3f} ± {result.payload_half_width_kg:.3f} kg")
+    if result.payload_half_width_kg is not None:
+        lines.append(_payload_line(result.payload_kg, result.payload_half_width_kg))
     for why in dict.fromkeys(joint.reason for joint in result.joints if joint.reason):
         names = ", ".join(joint.joint for joint in result.joints if joint.reason == why)
         lines.append(f"not told apart to {100 * result.within:g} %: {names}; {why}")
-    if assumed := [joint for joint in result.joints if joint.source == "assumed"]:
-        names = ", ".join(joint.joint for joint in assumed)
-        lines.append(
-            f"joints.yaml assumes {assumed[0].stiffness_nm_per_rad:.4g} N·m/rad for {names}; --assume changes it"
-        )
-    usual = _USUAL_NOISE[result.measurement]
-    if result.residual_spread > _FAR_BEYOND * usual:
+    if negative := [joint.joint for joint in result.joints if joint.is_negative]:
+        lines.append(f"{', '.join(negative)}: {NEGATIVE}")
+    lines += _written_lines(result.joints)
+    usual = USUAL_NOISE[result.measurement]
+    if result.residual_spread > FAR_BEYOND * usual:
         lines.append(
             f"the residuals are far beyond the usual noise of {in_unit(usual, result.measurement)}: look for other "
             "elastic joints, another frame (--frame) or body (--end-effector), friction, and errors of the model"
         )
     if result.outlying_poses:
         lines.append(f"poses that do not fit the others: {', '.join(map(str, result.outlying_poses))}; check them")
-    held = [joint for joint in hinges_of(fit.model.arm.model) if joint not in fit.model.log.joints]
-    if held:
-        lines.append(f"not in the log, and taken as held where the model has them: {', '.join(held)}")
+    if result.held_joints:
+        lines.append(f"not in the log, and taken as held where the model has them: {', '.join(result.held_joints)}")
     if any(joint.reason for joint in result.joints) and result.joints[0].planned_half_width is None:
         lines.append("--plan 20 proposes poses that tell more")
     return lines + _beyond_any_plan(result.joints)
+
+
+def _payload_line(mass_kg: float | None, half_width_kg: float) -> str:
+    """The payload, or why there is none."""
+    if mass_kg is None:
+        return f"the poses do not tell the payload: its interval is ± {half_width_kg:.3g} kg wide"
+    return f"payload {mass_kg:.3f} ± {half_width_kg:.3f} kg"
+
+
+def _written_lines(joints: Sequence[JointStiffness]) -> list[str]:
+    """Values in `joints.yaml` of joints whose interval reaches to rigid."""
+    says: dict[Source, str] = {
+        "no upper end": "joints.yaml has the estimate, {}, although the interval reaches to rigid; --assume changes it",
+        "rigid": "joints.yaml has {} as rigid (.inf); --assume changes it",
+        "assumed": "joints.yaml has the assumed K for {}",
+    }
+    lines = []
+    for source, text in says.items():
+        own = [joint for joint in joints if joint.source == source]
+        names = ", ".join(
+            joint.joint if source == "rigid" else f"{joint.joint} {joint.stiffness_nm_per_rad:.4g} N·m/rad"
+            for joint in own
+        )
+        if own:
+            lines.append(text.format(names))
+    return lines
 
 
 def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
@@ -236,7 +263,7 @@ def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
 def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, console: Console) -> None:
     """Plan without a log: with usual noise, and deflections of a usual size."""
     candidates = _candidates(config, setting, console)
-    model, noise = setting.model(config, candidates), _USUAL_NOISE[setting.log.kind]
+    model, noise = setting.model(config, candidates), USUAL_NOISE[setting.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
     plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, config.plan)
     own = model.unknowns.slices["compliance"]
@@ -264,13 +291,13 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
 
 def _stiffness_cells(joint: JointStiffness) -> list[str]:
     low, high = joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad
-    if joint.source == "assumed" or low is None or high is None:
-        return ["-", "-", _percent(joint.half_width)]
+    if low is None or high is None:
+        return ["–", "–", _percent(joint.half_width)]
     return [f"{joint.stiffness_nm_per_rad:.4g}", f"{low:.4g} to {high:.4g}", _percent(joint.half_width)]
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+def _number(value: float | None, scale: float = 1.0) -> str:
+    return "–" if value is None else f"{scale * value:.2f}"
 
 
 def _percent(half: float | None) -> str:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from pydantic import Field
 from rich import box
 from rich.console import Console
@@ -20,6 +19,7 @@ from baselines import PositionCompensator
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity, read_mapping
 from elastic_env.core.errors import ConfigurationError, ElasticError, shown
 from elastic_env.core.signals import Array
+from elastic_env.core.yaml_text import yaml_of
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.model_text import is_file, is_text, name_of, without_declaration
 from elastic_env.motion.arm_references import Poses
@@ -238,7 +238,7 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
     mapping = read_mapping(Path(joints)) if isinstance(joints, str) else joints
     written["joints"] = "joints.yaml"
     for name, content in (("joints.yaml", mapping), ("robot.yaml", written)):
-        (folder / name).write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
+        (folder / name).write_text(yaml_of(dict(content)), encoding="utf-8")
     return folder / "robot.yaml"
 
 

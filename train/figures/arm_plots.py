@@ -81,6 +81,6 @@ def _names(fit: ArmFit) -> tuple[str, ...]:
 
 
 def _stiffness(joint: Any) -> str:
-    if joint.source == "assumed":
+    if joint.stiffness_high_nm_per_rad is None:
         return "not told apart"
     return f"K = {joint.stiffness_nm_per_rad:.4g} N·m/rad ± {100 * joint.half_width:.2g} %"

@@ -17,10 +17,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
-import yaml
-
 from elastic_env.core.errors import ConfigurationError, ResultsExistError, SystemFailedError, shortened
 from elastic_env.core.files import leads_out, write_whole
+from elastic_env.core.yaml_text import yaml_of
 
 RUNS = Path("runs")
 """Where results go unless a folder is named."""
@@ -68,7 +67,7 @@ def describe(folder: Path, configuration: dict[str, Any], seed: int | None) -> N
 def _description(configuration: dict[str, Any], seed: int | None) -> dict[str, str]:
     """Texts of the files that describe a run."""
     return {
-        CONFIG: yaml.safe_dump(configuration, sort_keys=False, allow_unicode=True),
+        CONFIG: yaml_of(configuration),
         "metadata.json": json.dumps(provenance(seed), indent=2) + "\n",
     }
 

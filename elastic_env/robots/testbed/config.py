@@ -84,4 +84,4 @@ def _rest_angle(theta: Array, factor: Parameter = 1.0, *, form: str, true: Robot
         return theta
     half = np.sign(theta) * true.backlash / 2.0
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
-    return static_link_angle(engaged, stiffness, pendulum.torque, pendulum.torque_gradient)
+    return static_link_angle(engaged, stiffness, pendulum.torque, pendulum.torque_gradient, unique=False)

@@ -1,0 +1,207 @@
+r"""Equilibria of links on soft springs, by a load that grows from zero.
+
+The link angle q at rest solves q = θ − C τ(q) with the compliance C = K⁻¹. Where the load bends a spring far, the
+equation may have several solutions, and Newton's steps from θ may fail or end at any of them. With the share λ of the
+load from 0 to 1, the solutions of q = θ − λ C τ(q) form a path from θ. Along it 1 + λ C ∂τ/∂q has positive eigenvalues
+as long as the pose is stable. Where one of them reaches zero, the link tips over and the path ends.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from elastic_env.core.signals import Array, BoolArray, IntArray
+
+TorqueFunction = Callable[[Array], Array]
+
+_MOST_STEPS = 200
+_MOST_NEWTON_STEPS = 12
+_FARTHEST_RAD = 0.5
+"""Largest way in one step: a longer one might leave the path."""
+_WOUND_RAD = np.pi
+"""Deflection of other equilibria that count, at most: half a turn of the spring."""
+_SCANS = 96
+_OTHER_RAD = 1e-2
+"""Least distance of two equilibria that count as two."""
+
+
+@dataclass(frozen=True)
+class LoadPath:
+    """End of the path, one for each row.
+
+    Attributes:
+        q: Last stable link angles on the path, (..., n) [rad].
+        load: Share of the load there, (..., 1); 1 where the path leads to an equilibrium.
+        joint: Joint that gives way most easily there, (...).
+        other: Another stable equilibrium of that joint, nan where none is known, (...) [rad].
+        lost: Rows without an equilibrium that is the only one, (..., 1). If there is one, others may not be complete.
+    """
+
+    q: Array
+    load: Array
+    joint: IntArray
+    other: Array
+    lost: BoolArray
+
+    def reason(self, compliance: Array, names: Sequence[str] | None = None) -> str:
+        """Sentences that say why the first lost row has no equilibrium, with the joint.
+
+        Args:
+            compliance: C, broadcast against (..., n) [rad/(N·m)].
+            names: Names of the joints; None to count them.
+        """
+        row = tuple(np.argwhere(self.lost[..., 0])[0])
+        joint = int(self.joint[row])
+        K = 1.0 / float(np.broadcast_to(compliance, self.q.shape)[(*row, joint)])
+        name = f"joint {joint + 1} of {self.q.shape[-1]}" if names is None else names[joint]
+        question = f"is the stiffness of {name} ({K:.6g} N·m/rad) too low for its load?"
+        if self.load[row] < 1.0:
+            return (
+                f"{question} At {100.0 * float(self.load[row][0]):.3g} % of the load K + ∂τ_g/∂q becomes singular: the "
+                "link tips over, and which pose it comes to rest in is not known"
+            )
+        return (
+            f"{question} The pose is bistable: the link can rest at {self.q[(*row, joint)]:.4g} rad and at "
+            f"{self.other[row]:.4g} rad"
+        )
+
+
+def follow_load(
+    theta: Array,
+    compliance: Array,
+    torque: TorqueFunction,
+    torque_gradient: TorqueFunction,
+    *,
+    tolerance: float,
+    rows: BoolArray | None = None,
+    within: tuple[Array, Array] | None = None,
+    unique: bool = True,
+    finest: float = 1e-8,
+) -> LoadPath:
+    """Follow the equilibrium from no load to the whole one.
+
+    A row does not depend on the other rows.
+
+    Args:
+        theta: Motor side, (..., n) [rad].
+        compliance: 1/K, broadcast against (..., n); zero for a rigid joint [rad/(N·m)].
+        torque: τ(q), from (..., n) to (..., n) [N·m].
+        torque_gradient: ∂τ/∂q, from (..., n) to (..., n, n) [N·m/rad].
+        tolerance: Largest residual of the equation that is accepted, beside 1 rad [rad].
+        rows: Rows to follow, (..., 1); the others stay at θ with the whole load. None for all.
+        within: Lowest and highest angles of other equilibria that count, (n,) each [rad].
+        unique: Whether to look for other equilibria.
+        finest: Share of the load in a step, at least. A path that needs smaller steps has ended.
+    """
+    springs = _Springs(theta, np.broadcast_to(compliance, theta.shape), torque, torque_gradient, tolerance)
+    is_open = np.ones((*theta.shape[:-1], 1), dtype=np.bool_) if rows is None else rows
+    q = theta
+    load = np.where(is_open, 0.0, 1.0)
+    step = np.ones_like(load)
+    lost = ~is_open
+    for _ in range(_MOST_STEPS):
+        target = np.minimum(load + step, 1.0)
+        trial, is_stable = springs.settle(q, target, is_open)
+        taken = is_open & is_stable
+        q = np.where(taken, trial, q)
+        load = np.where(taken, target, load)
+        step = np.where(taken, 2.0 * step, 0.25 * step)
+        is_open = is_open & (load < 1.0)
+        lost = is_open & (step < finest)
+        if lost.any() or not is_open.any():
+            break
+    else:
+        lost = is_open
+    joint = np.zeros(theta.shape[:-1], dtype=np.int64)
+    other = np.full(theta.shape[:-1], np.nan)
+    if lost.any():
+        joint = springs.softest(q, load)
+    elif unique:
+        joint, other = springs.others(q, np.ones_like(lost) if rows is None else rows, within)
+        lost = ~np.isnan(other)[..., None]
+    return LoadPath(q, load, joint, other, lost)
+
+
+@dataclass(frozen=True)
+class _Springs:
+    """Links on springs; attributes as the arguments of `follow_load`."""
+
+    theta: Array
+    compliance: Array
+    torque: TorqueFunction
+    torque_gradient: TorqueFunction
+    tolerance: float
+
+    def settle(self, start: Array, load: Array, rows: BoolArray) -> tuple[Array, BoolArray]:
+        """Equilibria under shares of the load by Newton's steps, and which rows have a stable one near the start."""
+        C = load * self.compliance
+        q = start
+        is_good = rows
+        is_done = ~rows
+        for _ in range(_MOST_NEWTON_STEPS):
+            residual = q - self.theta + C * self.torque(q)
+            matrix = self._matrix(q, C, is_good)
+            is_good = is_good & (np.real(np.linalg.eigvals(matrix)).min(axis=-1, keepdims=True) > 0.0)
+            size = self.tolerance * (1.0 + np.abs(q).max(axis=-1, keepdims=True))
+            is_done = is_done | (np.abs(residual).max(axis=-1, keepdims=True) <= size)
+            moves = is_good & ~is_done
+            if not moves.any():
+                break
+            matrix = np.where(moves[..., None], matrix, np.eye(q.shape[-1]))
+            q = np.where(moves, q - np.linalg.solve(matrix, residual[..., None])[..., 0], q)
+            is_near = np.abs(q - start).max(axis=-1, keepdims=True) <= _FARTHEST_RAD
+            q = np.where(is_near, q, start)
+            is_good = is_good & is_near
+        return q, is_good & is_done
+
+    def softest(self, q: Array, load: Array) -> IntArray:
+        """Joint that moves most in the direction that gives way most easily, (...)."""
+        matrix = self._matrix(q, load * self.compliance, np.ones_like(load, dtype=np.bool_))
+        values, vectors = np.linalg.eig(matrix)
+        least = np.real(values).argmin(axis=-1)[..., None, None]
+        return np.abs(np.take_along_axis(vectors, least, axis=-1)[..., 0]).argmax(axis=-1)
+
+    def others(self, q: Array, rows: BoolArray, within: tuple[Array, Array] | None) -> tuple[IntArray, Array]:
+        """Joints that can rest elsewhere, and where, nan for none: found along each joint alone, then of all joints."""
+        n = q.shape[-1]
+        lowest, highest = (np.full(n, -np.inf), np.full(n, np.inf)) if within is None else within
+        other = np.full(q.shape[:-1], np.nan)
+        joint = np.zeros(q.shape[:-1], dtype=np.int64)
+        whole = np.ones_like(rows, dtype=np.float64)
+        for i in range(n):
+            for start in self._crossings(q, i):
+                is_new = rows & np.isnan(other)[..., None] & ~np.isnan(start)[..., None]
+                if not is_new.any():
+                    continue
+                begin = q.copy()
+                begin[..., i] = np.where(is_new[..., 0], start, q[..., i])
+                found, is_stable = self.settle(begin, whole, is_new)
+                is_other = is_new & is_stable & (np.abs(found - q).max(axis=-1, keepdims=True) > _OTHER_RAD)
+                is_other = is_other & (np.abs(found - self.theta) <= _WOUND_RAD).all(axis=-1, keepdims=True)
+                is_other = is_other & ((found >= lowest) & (found <= highest)).all(axis=-1, keepdims=True)
+                other = np.where(is_other[..., 0], found[..., i], other)
+                joint = np.where(is_other[..., 0], i, joint)
+        return joint, other
+
+    def _crossings(self, q: Array, i: int) -> list[Array]:
+        """Angles of joint i at which its spring and its load balance stably while the others stay, nan for none."""
+        moved = q.copy()
+        values = []
+        angles = self.theta[..., i] + np.linspace(-_WOUND_RAD, _WOUND_RAD, _SCANS).reshape(-1, *[1] * (q.ndim - 1))
+        for angle in angles:
+            moved[..., i] = angle
+            values.append((moved - self.theta + self.compliance * self.torque(moved))[..., i])
+        starts = []
+        for (left, low), (right, high) in pairwise(zip(angles, values, strict=True)):
+            is_crossed = (low < 0.0) & (high >= 0.0)
+            if is_crossed.any():
+                share = np.where(is_crossed, low / np.where(is_crossed, low - high, 1.0), 0.0)
+                starts.append(np.where(is_crossed, left + share * (right - left), np.nan))
+        return starts
+
+    def _matrix(self, q: Array, C: Array, rows: BoolArray) -> Array:
+        """1 + C ∂τ/∂q of some rows, (..., n, n), and 1 of the others."""
+        own = np.eye(q.shape[-1]) + C[..., None] * self.torque_gradient(q)
+        return np.where(rows[..., None] & np.isfinite(own).all(axis=(-2, -1), keepdims=True), own, np.eye(q.shape[-1]))
