@@ -146,8 +146,8 @@ def _append(values: "array[float]", file: Path, where: str, names: tuple[str, ..
             value = math.nan
         if not math.isfinite(value):
             raise ConfigurationError(
-                f"{shortened(file)} must hold a header and rows of numbers: {where}, column {shown(name)[1:-1]}: a finite number "
-                f"is needed, got {shown(cell)}; {_cure_of(cell)}"
+                f"{shortened(file)} must hold a header and rows of numbers: {where}, column {shown(name)[1:-1]}: "
+                f"a finite number is needed, got {shown(cell)}; {_cure_of(cell)}"
             )
         values.append(value)
 
