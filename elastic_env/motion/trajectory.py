@@ -8,7 +8,6 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.core.state import Stateful
 
 STAND_S = 1.0
 """Time at the first position in which policies ramp in; not scored."""
@@ -116,7 +115,7 @@ class Planned(Protocol):
         ...
 
 
-class PlanTable(Stateful):
+class PlanTable:
     """The plans of all worlds as tables, one row per control step; a plan without randomness is held once.
 
     Args:
@@ -124,8 +123,6 @@ class PlanTable(Stateful):
         control_period_s: Time between commands [s].
         num_worlds: How many.
     """
-
-    STATE = ("_motion",)
 
     def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
         self._reference, self._period = reference, control_period_s

@@ -15,7 +15,6 @@ from gymnasium.vector.utils import batch_space
 from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
-from elastic_env.core.state import Stateful
 from elastic_env.rendering.picture import Picture
 from elastic_env.runtime.physics import Simulation
 from elastic_env.runtime.robot_model import RobotModel
@@ -157,7 +156,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
 
 class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
-    _Faces, Stateful, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+    _Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
 ):
     """Many worlds of a task on a thread pool.
 
@@ -172,8 +171,6 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         render_mode: "rgb_array" or None.
         picture: Makes the picture of the task when it is first rendered.
     """
-
-    STATE = ("_worlds", "_generators", "_done")
 
     def __init__(
         self,

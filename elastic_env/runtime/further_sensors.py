@@ -23,7 +23,6 @@ import numpy as np
 from elastic_env.core.draws import Draws
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
-from elastic_env.core.state import Stateful
 from elastic_env.runtime.scenario import Scenario
 from elastic_env.runtime.sensors import NoiseStream, angle_of_count, quantise
 
@@ -98,7 +97,7 @@ def specific_force(model: mujoco.MjModel, sensordata: Array) -> Array:
     return sensordata[:, begin : begin + 3].copy()
 
 
-class FurtherSensors(Stateful):
+class FurtherSensors:
     """What some sensors of all worlds show.
 
     Args:
@@ -110,8 +109,6 @@ class FurtherSensors(Stateful):
     Raises:
         ConfigurationError: There is no such sensor.
     """
-
-    STATE = ("_noise", "_offset", "_now", "_before")
 
     def __init__(
         self,

@@ -18,7 +18,6 @@ from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
-from elastic_env.core.state import Stateful
 from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.joint.joint_names import JointAddresses, servo_name, spring_name
@@ -213,7 +212,7 @@ def observation_signals(joints: Sequence[str]) -> tuple[Signal, ...]:
     return SignalTable.of(made).signals
 
 
-class JointTask(Stateful):
+class JointTask:
     """Rules of a robot of elastic joints, see `elastic_env.runtime.task.Task`.
 
     Args:
@@ -225,12 +224,6 @@ class JointTask(Stateful):
     Raises:
         ConfigurationError: An unknown sensor, or the IMU of the link on a robot of several joints.
     """
-
-    STATE = (
-        "_reference", "_noise", "_sensors", "_step", "_present", "_coming", "_state", "_measured", "_shown",
-        "_encoder_bias", "_imu_bias", "_imu", "_offset", "_offset_before", "_command", "_diverged", "_force",
-        "_factor", "_stiffness",
-    )  # fmt: skip
 
     failure_names: tuple[str, ...] = ()  # what stands on a fixed base cannot fall over
 
@@ -280,9 +273,6 @@ class JointTask(Stateful):
     def num_steps(self) -> int:
         """Control steps of an episode."""
         return self._reference.num_steps
-
-    def furnish(self, simulation: Simulation) -> None:
-        """See `elastic_env.runtime.task.Task`; all that differs is varied, which the physics keeps."""
 
     def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
         """Place the robot at rest under zero offset: the servos hold q_ref, the springs are already deflected."""

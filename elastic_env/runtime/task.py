@@ -61,10 +61,6 @@ class Task(Protocol):
         """Begin new episodes in some worlds, a (num_worlds,) mask; one of `draws` for every world of the batch."""
         ...
 
-    def furnish(self, simulation: Simulation) -> None:
-        """After `set_state`: give the worlds what of their robots the state of the physics does not hold."""
-        ...
-
     def command(self, offset: Array, inputs: Array) -> None:
         """Command offsets, (num_worlds, n) [rad], already within bounds, as inputs of the servos, (num_worlds, nu)."""
         ...

@@ -14,7 +14,6 @@ from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ActionError
 from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, Signals
-from elastic_env.core.state import Stateful
 from elastic_env.runtime.metrics import EpisodeMetrics
 from elastic_env.runtime.physics import Simulation, simulate
 from elastic_env.runtime.step_info import StepInfo
@@ -52,7 +51,7 @@ class _Sample(Rows):
     diverged: BoolArray
 
 
-class Worlds(Stateful):
+class Worlds:
     """Runs a task in many worlds: checks actions, advances physics, adds up metrics, says why episodes end.
 
     Args:
@@ -61,8 +60,6 @@ class Worlds(Stateful):
         is_scalar: Whether errors speak of one world, whose action has no axis of worlds.
         simulation: What moves instead of MuJoCo, such as hardware.
     """
-
-    STATE = ("task", "simulation", "_metrics", "_begun")
 
     def __init__(
         self, task: Task, num_threads: int = 0, is_scalar: bool = False, simulation: Simulation | None = None
@@ -82,17 +79,6 @@ class Worlds(Stateful):
         self._no_reason = np.full(task.num_worlds, "", dtype="<U1")
         self._no_reason.flags.writeable = False
         compile_now(self._checked, np.zeros(self._shape))  # the first step of a motion cannot wait
-
-    def get_state(self) -> dict[str, Any]:
-        """See `Stateful`; what has not been scored is scored now."""
-        self.score_samples()
-        return super().get_state()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """See `Stateful`."""
-        super().set_state(state)
-        self.task.furnish(self.simulation)
-        self._is_begun = bool(self._begun.all())
 
     @property
     def num_worlds(self) -> int:

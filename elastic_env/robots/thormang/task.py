@@ -66,7 +66,6 @@ from elastic_env.core.draws import Draws
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
-from elastic_env.core.state import Stateful
 from elastic_env.dynamics import walk_kernels as kernels
 from elastic_env.dynamics.ground_contact import FootSensors
 from elastic_env.joint.elasticity import joint_torque
@@ -146,13 +145,8 @@ class _Kind:
         return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
 
 
-class WalkTask(Stateful):
+class WalkTask:
     """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.runtime.task.Task`."""
-
-    STATE = (
-        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_sensors", "_rows", "_rows_before", "_offset",
-        "_has_fallen",
-    )  # fmt: skip
 
     name = NAME
     action_table = ACTION
@@ -411,11 +405,6 @@ class WalkTask(Stateful):
     def _robot(self, world: int) -> RobotDraw:
         """The robot of a world."""
         return self._kind_of_world[world].bank[self._draw[world]]
-
-    def furnish(self, simulation: Simulation) -> None:
-        """See `Task`."""
-        for world in range(self.num_worlds):
-            simulation.take(world, self._placed(world).model)
 
     def _placed(self, world: int) -> PlacedRobot:
         """The robot of a world, at rest."""
