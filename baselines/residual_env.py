@@ -23,7 +23,7 @@ from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.runtime.envs import final_of, reset_mask
-from elastic_env.runtime.worlds import Transition
+from elastic_env.runtime.task import Transition
 
 
 class _Deciding:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics import walk_kernels as kernels
+from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.robots.thormang.environment import make_vector
 from elastic_env.robots.thormang.rows import TRUTH
 from elastic_env.runtime.scenario import make_scenario
@@ -191,7 +191,7 @@ def test_what_moves_the_pelvis_disturbs_the_attitude() -> None:
     for _ in range(steps):
         observation, *_, info = env.step(STILL)
         error.append(observation[0, columns] - [info["pelvis_roll"][0], info["pelvis_pitch"][0]])
-        velocity.append(task._rows["truth"]["pelvis_velocity"][0].copy())
+        velocity.append(task.sample().worlds["truth"]["pelvis_velocity"][0].copy())
     force = np.diff(velocity, axis=0) / period_s + [0.0, 0.0, G]
     direction = force / np.linalg.norm(force, axis=1)[:, None]
     # to the left is a positive roll, forward a negative pitch; the heading stays

@@ -236,10 +236,12 @@ class JointPicture(ModelPicture):
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002  the truth has every joint
         """See `HasSides`."""
         truth = self._task.truth()
-        return Sides(self._task.sample().q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
+        q_ref = self._task.sample().joints["truth"]["q_ref"]
+        return Sides(q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
 
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the truth has every joint
-        q, q_ref = self._task.truth().q[world], self._task.sample().q_ref[world]
+        q = self._task.truth().q[world]
+        q_ref = self._task.sample().joints["truth"]["q_ref"][world]
         drawn = q_ref + _ENLARGED * (q - q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos, self._data.joint(_REFERENCE + name).qpos = angle, reference

@@ -20,7 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from elastic_env.core.draws import Draws
+from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
 from elastic_env.runtime.scenario import Scenario
@@ -28,7 +28,7 @@ from elastic_env.runtime.sensors import NoiseStream, angle_of_count, quantise
 
 
 @dataclass(frozen=True)
-class Felt:
+class SensorInputs:
     """What sensors need of the truth of a task, one row per world.
 
     Attributes:
@@ -58,7 +58,7 @@ class Sensor:
 
     unit: str
     meaning: str
-    truth: Callable[[Felt], Array]
+    truth: Callable[[SensorInputs], Array]
     axes: Mapping[str, Mirrored] | None = None
     noise: float = 0.0
     offset: float = 0.0
@@ -91,8 +91,10 @@ def add_accelerometer(spec: mujoco.MjSpec, site: str) -> None:
     )
 
 
-def specific_force(model: mujoco.MjModel, sensordata: Array) -> Array:
-    """The accelerometer's columns of `sensordata`, (num_worlds, 3) [m/s²]."""
+def specific_force(model: mujoco.MjModel, sensordata: Array | None, num_worlds: int) -> Array:
+    """The accelerometer's columns of `sensordata`, (num_worlds, 3) [m/s²]; nan without these."""
+    if sensordata is None:
+        return np.full((num_worlds, 3), np.nan)
     begin = int(model.sensor(ACCELEROMETER).adr[0])
     return sensordata[:, begin : begin + 3].copy()
 
@@ -136,7 +138,7 @@ class FurtherSensors:
         """Whether there is any."""
         return bool(self._sensors)
 
-    def restart(self, worlds: BoolArray, draws: Sequence[Draws], truth: Felt) -> None:
+    def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs) -> None:
         """Draw the offsets of new episodes, and measure."""
         if self._noise is None:
             return
@@ -144,12 +146,12 @@ class FurtherSensors:
             for name, sensor in self._sensors.items():
                 offset = self._offset[name]
                 width = self._homing_rad[world] if sensor.is_encoder else self._scale[world] * sensor.offset
-                offset[world] = width * draws[world].robot.uniform(-1.0, 1.0, offset.shape[1])
-            self._noise.restart(world, draws[world].noise())
+                offset[world] = width * random[world].robot.uniform(-1.0, 1.0, offset.shape[1])
+            self._noise.restart(world, random[world].noise())
         self.measure(worlds, truth)
         self._before = np.where(worlds[:, None], self._now, self._before)
 
-    def measure(self, worlds: BoolArray, truth: Felt) -> None:
+    def measure(self, worlds: BoolArray, truth: SensorInputs) -> None:
         """Take new values in some worlds; the others keep theirs."""
         if self._noise is None:
             return
