@@ -232,7 +232,7 @@ class Links(NamedTuple):
 
     Attributes:
         schedule: What the reference says of every step, (steps,).
-        constants: Records of `LINK_CONSTANTS`, (kinds,).
+        constants: Weights of the reward and quality of the IMU, (1,).
         imu_bias: Offset of the IMU on the only link, (num_worlds,) [rad].
         imu_column: Where it is observed, −1 for nowhere.
         imu_angle: Angle of the link as an inertial IMU computes it, (num_worlds,) [rad]; None for one that shows the
@@ -255,7 +255,7 @@ def begin_links(qpos: Array, qvel: Array, joints: Any, links: Any, noise: Any, w
         if worlds[world]:
             truth, shown = steps.worlds[world].truth, steps.worlds[world].shown
             truth.scored, truth.rest = links.schedule[0].scored, links.schedule[0].rest
-            constants = links.constants[joints.kind[world]]
+            constants = links.constants[0]
             q = steps.joints[world, 0].truth.q
             show_link(noise, world, q, links.imu_angle, links.imu_bias[world], constants, shown)
             shown.visible_imu = shown.imu
@@ -287,7 +287,7 @@ def sense_links(
     is_over = False
     for world in range(len(diverged)):
         kind = joints.kind[world]
-        constants = links.constants[kind]
+        constants = links.constants[0]
         truth, shown, scores = steps.worlds[world].truth, steps.worlds[world].shown, steps.worlds[world].scores
         last = len(links.schedule) - 1
         planned = links.schedule[min(truth.step, last)]

@@ -327,11 +327,19 @@ def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> 
             )
 
 
-def _rest_angle(command: Array, factor: Parameter = 1.0, *, form: str, true: RobotModel, body: TreeTorque) -> Array:
+def _rest_angle(
+    command: Array,
+    factor: Parameter = 1.0,
+    backlash: Array | None = None,
+    *,
+    form: str,
+    true: RobotModel,
+    body: TreeTorque,
+) -> Array:
     """Link angles at rest without friction: a dead band is crossed to the side to which the load pulls."""
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return command
-    engaged = command - np.sign(body.gravity_torque(command)) * true.backlash / 2.0
+    engaged = command - np.sign(body.gravity_torque(command)) * (true.backlash if backlash is None else backlash) / 2.0
     finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
     return static_link_angle(engaged, finite, body.gravity_torque, body.gravity_gradient)

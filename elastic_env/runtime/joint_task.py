@@ -16,6 +16,7 @@ import numpy as np
 
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
+from elastic_env.core.robot_ranges import RobotDraw, draw_robot
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals
 from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.dynamics.tree.end_effector import EndEffector
@@ -81,7 +82,7 @@ class JointPlant:
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
         rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad], and if they differ
-            from the true ones the springs' factors, (..., n) [1].
+            from the true ones the springs' factors, (..., n) [1], and the dead bands, (..., n) [rad].
         motion: The reference as all joints follow it.
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
             q = 0 [m]; None where there is no such IMU.
@@ -170,12 +171,17 @@ class JointTask(Task):
                 *(METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL),
                 *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
             ),
-            rules=one(
-                RULES,
-                control_period_s=period_s,
-                is_delayed=scenario.delay_steps > 0,
-                count_rad=count_rad,
-                highest_rad_s=DIVERGED_RAD_S,
+            rules=np.concatenate(
+                [
+                    one(
+                        RULES,
+                        control_period_s=period_s,
+                        is_delayed=is_delayed,
+                        count_rad=count_rad,
+                        highest_rad_s=DIVERGED_RAD_S,
+                    )
+                    for is_delayed in (False, True)
+                ]
             ),
         )
         self._plant = plant
@@ -192,9 +198,7 @@ class JointTask(Task):
             imu_bias_rad=scenario.imu.bias_rad,
             imu_sine_error_rad=scenario.imu.sine_error_rad,
         )
-        self._factor = np.ones((num_worlds, len(joints)))
-        spread = joints if scenario.stiffness_spread > 0.0 and config.form == "tendon" else []
-        self._springs = [self.model.tendon(spring_name(joint)).id for joint in spread]
+        self._springs = [int(self.model.tendon(spring_name(joint)).id) for joint in joints if config.form == "tendon"]
 
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
         """Windows at rest of `hold`; all but standing and onset of the other references."""
@@ -214,33 +218,43 @@ class JointTask(Task):
             model=self._true_model,
         )
 
+    def _has_ranges(self, world: int) -> bool:  # noqa: ARG002  all worlds have one scenario
+        return bool(self.config.scenario.ranges)
+
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         scenario = self.config.scenario
         generator = random.robot
-        model = self._true_model
         n = len(self._joint_names)
         self._reference.draw(world, generator)
-        truth = self._joints[self._row, world]["truth"]
-        truth["homing"] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
-        self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
+        homing = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
+        mounting = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
         self._noise.restart(world, random.noise())
         if self._imu is not None:
-            self._imu_bias[world] += self._imu.draw(world, generator, random.noise())
+            mounting += self._imu.draw(world, generator, random.noise())
+        factor = np.ones(n)
         if scenario.stiffness_spread > 0.0:
-            self._factor[world] = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
-        truth["stiffness"] = self._factor[world] * model.stiffness
-        truth["damping"] = model.damping
-        truth["backlash"] = model.backlash
+            factor = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
+        robot = RobotDraw(
+            stiffness_factor=tuple(factor.tolist()),
+            encoder_bias_rad=tuple(homing.tolist()),
+            imu_bias_rad=(float(mounting), 0.0),
+            is_delayed=scenario.delay_steps > 0,
+        )
+        if scenario.ranges:
+            robot = draw_robot([ranges.on_fixed_base() for ranges in scenario.ranges], n, generator)
+        self._take_robot(world, robot, self._true_model)
+        self._imu_bias[world] = robot.imu_bias_rad[0]
+        self._kind[world] = int(robot.is_delayed)
 
     def _place(self, worlds: BoolArray) -> None:
         """The servos hold q_ref, the springs are already deflected."""
         simulation, at = self.simulation, self._at
-        if self._springs:
-            of_springs = self._factor[worlds] * self.model.tendon_stiffness[self._springs]
-            simulation.vary("tendon_stiffness")[np.ix_(worlds, self._springs)] = of_springs
+        truth = self._joints[self._row]["truth"][worlds]
+        self._vary(worlds, truth)
         q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
-        command = q_ref - self._joints[self._row]["truth"]["homing"][worlds]
-        q = self._plant.rest_angle(command, self._factor[worlds])
+        command = q_ref - truth["homing"]
+        factor = np.array([robot.stiffness_factor for robot in self._drawn(worlds)])
+        q = self._plant.rest_angle(command, factor, truth["backlash"])
         torque = self._plant.static_torque(q)
         simulation.qpos[np.ix_(worlds, at["theta"])] = command - self._true_model.servo_compliance * torque
         simulation.qpos[np.ix_(worlds, at["q"])] = q
@@ -252,6 +266,31 @@ class JointTask(Task):
         if self._sensors:
             simulation.bind("sensordata")
             simulation.refresh(worlds)
+
+    def _vary(self, worlds: BoolArray, truth: Records) -> None:
+        """Give the physics the joints that were drawn, (worlds, n)."""
+        scenario, model, simulation = self.config.scenario, self.model, self.simulation
+        if not scenario.ranges and scenario.stiffness_spread == 0.0:
+            return
+        springs = np.ix_(worlds, np.array(self._springs, dtype=np.int64))
+        if self._springs:
+            simulation.vary("tendon_stiffness")[springs] = truth["stiffness"]
+        if not scenario.ranges:
+            return
+        robots = self._drawn(worlds)
+        if self._springs:
+            further_backlash = np.array([[[robot.backlash_rad]] for robot in robots]) * [-0.5, 0.5]
+            simulation.vary("tendon_damping")[springs] = truth["damping"]
+            ends = model.tendon_lengthspring[self._springs] + further_backlash
+            simulation.vary("tendon_lengthspring")[springs] = ends
+        links = np.ix_(worlds, self._at["q_dot"])
+        factor = np.array([[robot.friction_factor] for robot in robots])
+        for field in ("dof_frictionloss", "dof_damping"):
+            simulation.vary(field)[links] = factor * getattr(model, field)[self._at["q_dot"]]
+
+    def _drawn(self, worlds: BoolArray) -> list[RobotDraw]:
+        """The robots of some worlds."""
+        return [robot for robot, chosen in zip(self._robots, worlds, strict=True) if chosen and robot is not None]
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
         simulation, joints = self.simulation, self._constants
@@ -338,11 +377,16 @@ def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Reco
 
 
 def stiffest(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
-    """A model with the stiffest springs that a scenario draws; all tendons with stiffness count as springs."""
-    if scenario.stiffness_spread == 0.0:
+    """A model with the stiffest springs and strongest dampers that a scenario draws; tendons count as springs."""
+    stiffness = [1.0 + scenario.stiffness_spread] + [
+        own.stiffness[1] * own.joint_stiffness[1] for own in scenario.ranges
+    ]
+    damping = [1.0] + [own.damping[1] for own in scenario.ranges]
+    if max(stiffness) == max(damping) == 1.0:
         return model
     stiff = copy.copy(model)
-    stiff.tendon_stiffness[:] *= 1.0 + scenario.stiffness_spread
+    stiff.tendon_stiffness[:] *= max(stiffness)
+    stiff.tendon_damping[:] *= max(damping)
     return stiff
 
 

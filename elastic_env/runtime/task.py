@@ -20,6 +20,7 @@ import numpy.typing as npt
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
+from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, Kind, Mirrored, Signal, SignalGroup, Signals, SignalTable
 from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.joint.elasticity import joint_torque
@@ -138,6 +139,7 @@ class Task(ABC):
         self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
         self._rules = rules
         self._kind = np.zeros(num_worlds, dtype=np.int64)
+        self._robots: list[RobotDraw | None] = [None] * num_worlds
         self._noise = NoiseStream(num_worlds, self.noise_type)
         self._bound = self.action_table.space(np.float32).high.astype(np.float64)
         self._failures = (DIVERGED, *self.failure_names)
@@ -171,8 +173,8 @@ class Task(ABC):
             random: Generators of every world.
         """
         simulation = self.simulation
-        self._take_rows(2)
         self.score()
+        self._take_rows(2)
         simulation.restart(worlds)
         self._metrics.restart(worlds)
         last, now = self._row - 1, self._row
@@ -264,6 +266,11 @@ class Task(ABC):
     def masks(self, sample: Sample) -> dict[str, BoolArray]:
         """Rows that count in the metrics, "scored", and the parts of them that the metrics name."""
 
+    def robot_record(self, world: int) -> dict[str, float]:
+        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
+        robot = self._robots[world]
+        return robot.record() if robot is not None and self._has_ranges(world) else {}
+
     @abstractmethod
     def truth(self) -> Any:
         """Noise-free state and true parameters, for rewards, metrics and the oracle."""
@@ -271,8 +278,12 @@ class Task(ABC):
     # what differs from robot to robot
 
     @abstractmethod
+    def _has_ranges(self, world: int) -> bool:
+        """Whether a world draws its robots from ranges."""
+
+    @abstractmethod
     def _draw(self, world: int, random: EpisodeRandom) -> None:
-        """Draw robot, sensors and noise of a new episode, and write what is true of its joints."""
+        """Draw robot, sensors and noise of a new episode, see `_take_robot`."""
 
     @abstractmethod
     def _place(self, worlds: BoolArray) -> None:
@@ -298,6 +309,21 @@ class Task(ABC):
     @abstractmethod
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
+
+    def _take_robot(self, world: int, robot: RobotDraw, true_model: RobotModel) -> None:
+        """Keep the robot of a world, and write what is true of its joints.
+
+        Args:
+            world: Number of the world.
+            robot: As it was drawn.
+            true_model: The true robot, what is drawn aside.
+        """
+        self._robots[world] = robot
+        truth = self._joints[self._row, world]["truth"]
+        truth["homing"] = robot.encoder_bias_rad
+        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness_factor)
+        truth["damping"] = true_model.damping * robot.damping_factor
+        truth["backlash"] = true_model.backlash + robot.backlash_rad
 
     def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
         """Apply what acts on the robot from outside during the coming control period."""

@@ -182,7 +182,6 @@ class WalkTask(Task):
         self._inertial = _inertial(self._fits, robot.gravity)
         self._plan_rows = _plan_rows(self.plan, config)
         self._walk_columns = columns_of(OBSERVATION, COLUMNS)
-        self._drawn = np.zeros(num_worlds, dtype=np.int64)
         self._pushes = any(robot.push_n > 0.0 for kind in self._kinds for robot in kind.bank)
         self._push_steps = np.array([
             round(kind.config.scenario.push_s / config.control_period_s) for kind in self._kind_of_world
@@ -208,25 +207,19 @@ class WalkTask(Task):
             models=tuple(kind.true_model for kind in self._kinds),
         )
 
-    def robot_record(self, world: int) -> dict[str, float]:
-        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
-        return self._robot(world).record() if self._kind_of_world[world].config.scenario.ranges else {}
+    def _has_ranges(self, world: int) -> bool:
+        return bool(self._kind_of_world[world].config.scenario.ranges)
 
     def _draw(self, world: int, random: EpisodeRandom) -> None:
         generator = random.robot
         kind, bias = self._kind_of_world[world], self._bias
-        self._drawn[world] = generator.integers(len(kind.bank))
-        robot = self._robot(world)
+        robot = kind.bank[int(generator.integers(len(kind.bank)))]
+        self._take_robot(world, robot, kind.true_model)
         mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
         bias["imu_attitude"][world] = mounting + np.array(robot.imu_bias_rad)
         self._draw_push(world, random)
         self._noise.restart(world, random.noise())
         self._kind[world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
-        truth = self._joints[self._row, world]["truth"]
-        truth["homing"] = robot.encoder_bias_rad
-        truth["stiffness"] = kind.true_model.stiffness * np.array(robot.stiffness_factor)
-        truth["damping"] = kind.true_model.damping * robot.damping_factor
-        truth["backlash"] = kind.true_model.backlash + robot.backlash_rad
         self._draw_imu(world, generator)
 
     def _draw_push(self, world: int, random: EpisodeRandom) -> None:
@@ -249,7 +242,9 @@ class WalkTask(Task):
 
     def _robot(self, world: int) -> RobotDraw:
         """The robot of a world."""
-        return self._kind_of_world[world].bank[self._drawn[world]]
+        robot = self._robots[world]
+        assert robot is not None
+        return robot
 
     def _placed(self, world: int) -> PlacedRobot:
         """The robot of a world, at rest."""
