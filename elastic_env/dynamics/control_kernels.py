@@ -424,13 +424,14 @@ def sense_walk(physics: Any, joints: Any, walker: Any, noise: Any, commanded: An
             read_body(physics, constants, world, truth)
             stand(physics, constants, world, truth, feet)
             drawn = sample_of(noise, world)
-            advance_imu(walker.inertial, kind, last.truth, truth, drawn, bias, constants, shown)
+            quality, period_s = constants.quality, joints.rules[kind].control_period_s
+            advance_imu(walker.inertial, kind, last.truth, truth, drawn, bias, quality, period_s, shown)
             measure(walker.inertial, kind, truth, drawn, bias, constants.quality, planned.imu_is_due, shown)
         watch_swing_foot(truth, planned, rules.loaded_n)
         is_last = truth.step >= len(walker.plan) - 1
         is_over = end(truth, rules, diverged[world], is_last, results.ends[:, world]) or is_over
         results.reward[world] = score(truth, planned, rules.weights, results.ends[-2, world], scores)
-        visible = last.shown if rules.is_delayed else shown
+        visible = last.shown if joints.rules[kind].is_delayed else shown
         observe_walk(visible, row_of(walker.plan, truth.step + 1), walker.columns[0], results.observed[world])
     return is_over
 
@@ -440,7 +441,7 @@ def show_walk(joints: Any, walker: Any, steps: Any, observed: Array) -> None:
     """The walker's columns of observations of the present state."""
     joints, walker, steps = Joints(*joints), Walker(*walker), Steps(*steps)
     for world in range(len(observed)):
-        is_delayed = walker.constants[joints.kind[world]].rules.is_delayed
+        is_delayed = joints.rules[joints.kind[world]].is_delayed
         visible = steps.last_worlds[world].shown if is_delayed else steps.worlds[world].shown
         coming = row_of(walker.plan, steps.worlds[world].truth.step + 1)
         observe_walk(visible, coming, walker.columns[0], observed[world])
@@ -576,7 +577,15 @@ def settle_imu(inertial: Any, kind: int, row: Any, noise: Any, bias: Any, qualit
 
 @compiled
 def advance_imu(
-    inertial: Any, kind: int, before: Any, row: Any, noise: Any, bias: Any, constants: Any, shown: Any
+    inertial: Any,
+    kind: int,
+    before: Any,
+    row: Any,
+    noise: Any,
+    bias: Any,
+    quality: Any,
+    period_s: float,
+    shown: Any,
 ) -> None:
     """What an inertial IMU makes of a control period: its gyroscope's mean rate, and the vertical by its filter.
 
@@ -587,12 +596,13 @@ def advance_imu(
         row: And at its end.
         noise: Sample of the sensors; that of the attitude is of the accelerometer, across the vertical.
         bias: Of the world.
-        constants: One row of `CONSTANTS`.
+        quality: One record of `QUALITY`.
+        period_s: Control period [s].
         shown: Measurements, whose `imu_gyro` and `imu_up` are brought up to date.
     """
     if inertial is None:
         return
-    sensor, quality, period_s = inertial[kind], constants.quality, constants.rules.control_period_s
+    sensor = inertial[kind]
     if not sensor.is_fitted:
         return
     force, turned = np.empty(3), np.empty(3)

@@ -134,10 +134,6 @@ class FurtherSensors:
         self._offset = {group.name: np.zeros((num_worlds, *group.shape)) for group in groups}
         self._now = self._before = np.zeros((num_worlds, len(self.signals)))
 
-    def __bool__(self) -> bool:
-        """Whether there is any."""
-        return bool(self._sensors)
-
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs) -> None:
         """Draw the offsets of new episodes, and measure."""
         if self._noise is None:

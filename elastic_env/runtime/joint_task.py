@@ -263,7 +263,7 @@ class JointTask(Task):
             if servo.integral_gain > 0.0:
                 integrator = self.model.actuator_actadr[at["servo"][column]]
                 simulation.act[worlds, integrator] = torque[:, column] / servo.integral_gain
-        if self._sensors:
+        if self._has_sensors:
             simulation.bind("sensordata")
             simulation.refresh(worlds)
 
@@ -290,7 +290,7 @@ class JointTask(Task):
 
     def _drawn(self, worlds: BoolArray) -> list[RobotDraw]:
         """The robots of some worlds."""
-        return [robot for robot, chosen in zip(self._robots, worlds, strict=True) if chosen and robot is not None]
+        return [self._robot(world) for world in np.flatnonzero(worlds).tolist()]
 
     def _begin_worlds(self, worlds: BoolArray) -> None:
         simulation, joints = self.simulation, self._constants

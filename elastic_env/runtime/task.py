@@ -135,6 +135,8 @@ class Task(ABC):
         self.metrics = metrics
         self._reference = reference
         self._sensors = sensors
+        self._has_sensors = bool(sensors.signals)
+        self._width = len(self.observation_table)
         self._at = addresses(model, joints)
         self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
         self._rules = rules
@@ -147,6 +149,8 @@ class Task(ABC):
         self._no_reason.flags.writeable = False
         self._begun = np.zeros(num_worlds, dtype=np.bool_)
         self._is_begun = False
+        self._steps_at_once = min(max(_SCORED_ROWS // num_worlds, _FEWEST_STEPS), _MOST_STEPS)
+        self._begin_block(np.zeros((2, num_worlds, len(joints)), JOINT), np.zeros((2, num_worlds), self.world_type))
 
     def attach(self, simulation: Simulation | None = None, num_threads: int = 0, is_scalar: bool = False) -> None:
         """Take what moves the robots, and compile all that a control step needs: hardware cannot wait for that later.
@@ -159,10 +163,8 @@ class Task(ABC):
         self.simulation = simulation or simulate(self.model, self.num_worlds, num_threads)
         self._is_scalar = is_scalar
         self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
-        at_once = min(max(_SCORED_ROWS // self.num_worlds, _FEWEST_STEPS), _MOST_STEPS)
-        # scoring many takes 2 ms, half a control period of hardware
-        self._steps_at_once = at_once if simulation is None else _FEWEST_STEPS
-        self._begin_block(np.zeros((2, self.num_worlds, len(self._at)), JOINT), self._world_records(2))
+        if simulation is not None:  # scoring many takes 2 ms, half a control period of hardware
+            self._steps_at_once = _FEWEST_STEPS
         compile_now(self._rehearse)
 
     def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
@@ -188,7 +190,7 @@ class Task(ABC):
         self._begin_worlds(worlds)
         for block in (self._joints, self._worlds):
             block[last][worlds] = block[now][worlds]
-        if self._sensors:
+        if self._has_sensors:
             self._sensors.restart(worlds, random, self._sensor_inputs())
         self._begun = self._begun | worlds
         self._is_begun = bool(self._begun.all())
@@ -219,7 +221,7 @@ class Task(ABC):
 
     def observe(self) -> Array:
         """A fresh observation of the present state, (num_worlds, len(observation_table))."""
-        observed = np.empty((self.num_worlds, len(self.observation_table)))
+        observed = np.empty((self.num_worlds, self._width))
         kernels.show_joints(self._constants, self._steps(), observed)
         self._show_worlds(observed)
         self._show_sensors(observed)
@@ -268,8 +270,7 @@ class Task(ABC):
 
     def robot_record(self, world: int) -> dict[str, float]:
         """The robot of a world in figures, where it was drawn from ranges; else nothing."""
-        robot = self._robots[world]
-        return robot.record() if robot is not None and self._has_ranges(world) else {}
+        return self._robot(world).record() if self._has_ranges(world) else {}
 
     @abstractmethod
     def truth(self) -> Any:
@@ -309,6 +310,12 @@ class Task(ABC):
     @abstractmethod
     def _signals(self, joints: Records, worlds: Records) -> Signals:
         """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
+
+    def _robot(self, world: int) -> RobotDraw:
+        """The robot of a world, from its first episode on."""
+        robot = self._robots[world]
+        assert robot is not None
+        return robot
 
     def _take_robot(self, world: int, robot: RobotDraw, true_model: RobotModel) -> None:
         """Keep the robot of a world, and write what is true of its joints.
@@ -359,13 +366,13 @@ class Task(ABC):
         """Truth, measurements, score and observation of the control step that has gone by; whether an episode ends."""
         n = self.num_worlds
         results = kernels.Results(
-            observed=np.empty((n, len(self.observation_table))),
+            observed=np.empty((n, self._width)),
             reward=np.empty(n),
             ends=np.empty((len(self._failures) + 2, n), dtype=np.bool_),
         )
         diverged = self.simulation.diverged()
         is_over = self._sense_worlds((offset, is_clipped, diverged, self._periods), tuple(results))
-        if self._sensors:
+        if self._has_sensors:
             self._sensors.measure(~diverged, self._sensor_inputs())
             self._show_sensors(results.observed)
         if self._has_further_terms:
@@ -379,7 +386,7 @@ class Task(ABC):
 
     def _show_sensors(self, observed: Array) -> None:
         """Fill the columns of further sensors."""
-        if self._sensors:
+        if self._has_sensors:
             is_delayed = self._rules["is_delayed"][self._kind]
             observed[:, -len(self._sensors.signals) :] = self._sensors.columns(is_delayed)
 
@@ -411,14 +418,11 @@ class Task(ABC):
         """Records for the next steps, behind those of the step before and of the present one."""
         steps = self._steps_at_once + 2
         self._joints = np.zeros((steps, *joints.shape[1:]), JOINT)
-        self._worlds = self._world_records(steps)
+        self._worlds = np.zeros((steps, self.num_worlds), self.world_type)
         self._joints[:2] = joints
         self._worlds[:2] = worlds
         self._row = 1
         self._unscored = 2
-
-    def _world_records(self, steps: int) -> Records:
-        return np.zeros((steps, self.num_worlds), self.world_type)
 
     def _rehearse(self) -> None:
         """Compile all kernels by a control step of records that nobody sees."""
@@ -430,7 +434,7 @@ class Task(ABC):
         self._sense(offset, is_clipped)
         self.observe()
         self.signals()
-        self._begin_block(np.zeros_like(self._joints[:2]), self._world_records(2))
+        self._begin_block(np.zeros_like(self._joints[:2]), np.zeros_like(self._worlds[:2]))
 
     def _reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
         """Reason of termination of every world, the first that applies, "" where there is none."""

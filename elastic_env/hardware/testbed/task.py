@@ -90,8 +90,8 @@ class HardwareTestbedTask(TestbedTask):
 
     def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
         """Behind the last step the pendulum is brought to rest."""
-        self._keep_cycle()  # before the way back to rest, which measures too
         is_over = super()._sense_worlds(commanded, results)
+        self._keep_cycle()  # before the way back to rest, which measures too
         if is_over:
             self.plant.finish()
         return is_over

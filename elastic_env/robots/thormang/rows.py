@@ -70,7 +70,6 @@ QUALITY = record_type(
 """Quality of the sensors: noise and constant errors."""
 
 WALK_RULES = record_type(
-    ("control_period_s", REAL), ("is_delayed", np.bool_),  # whether measurements are shown a step late
     ("lowest_pelvis_m", REAL), ("highest_tilt_rad", REAL),  # beyond them the robot has fallen
     ("loaded_n", REAL),  # vertical force of a loaded foot
     ("zmp_n", REAL),  # least vertical force for a ZMP

@@ -240,12 +240,6 @@ class WalkTask(Task):
             bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
             bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
 
-    def _robot(self, world: int) -> RobotDraw:
-        """The robot of a world."""
-        robot = self._robots[world]
-        assert robot is not None
-        return robot
-
     def _placed(self, world: int) -> PlacedRobot:
         """The robot of a world, at rest."""
         config = self._kind_of_world[world].config
@@ -407,8 +401,8 @@ def _joint_rules(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  
     )
 
 
-def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:
-    """What does not change of a robot, one row of `CONSTANTS`.
+def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001  that is of the joints
+    """What does not change of a robot, one record of `CONSTANTS`.
 
     Args:
         kind: Robots of its scenario.
@@ -419,25 +413,24 @@ def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:
     feet = [model.body(f"{side}_foot").id for side in SIDES]
     sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
     gravity = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    ankles = [model.site(f"{side}_ft").id for side in SIDES]
     loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * gravity
-    # sensors that carry nothing stand for a ground that carries the feet
-    zmp_n = loaded_n + float(model.body_mass[feet].sum()) * gravity
+    rules = one(
+        WALK_RULES,
+        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m,
+        highest_tilt_rad=FALL_TILT_RAD,
+        loaded_n=loaded_n,
+        # sensors that carry nothing stand for a ground that carries the feet
+        zmp_n=loaded_n + float(model.body_mass[feet].sum()) * gravity,
+        weights=one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()}),
+    )
     return one(
-        CONSTANTS, at=one(CONSTANTS["at"], ankles=ankles), foot_com=sensors.com, foot_weight=sensors.weight,
+        CONSTANTS,
+        at=one(CONSTANTS["at"], ankles=[model.site(f"{side}_ft").id for side in SIDES]),
+        foot_com=sensors.com,
+        foot_weight=sensors.weight,
         quality=_quality(_fitted(config.scenario, is_inertial)),
-        rules=_rules(config, is_delayed, loaded_n, zmp_n),
-    )  # fmt: skip
-
-
-def _rules(config: WalkConfig, is_delayed: bool, loaded_n: float, zmp_n: float) -> Records:
-    """Numbers that judge a control step, one record of `WALK_RULES`."""
-    weights = one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()})
-    return one(
-        WALK_RULES, control_period_s=config.control_period_s, is_delayed=is_delayed,
-        loaded_n=loaded_n, zmp_n=zmp_n, weights=weights,
-        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m, highest_tilt_rad=FALL_TILT_RAD,
-    )  # fmt: skip
+        rules=rules,
+    )
 
 
 def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
