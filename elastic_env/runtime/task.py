@@ -136,6 +136,7 @@ class Task(ABC):
         self._reference = reference
         self._sensors = sensors
         self._has_sensors = bool(sensors.signals)
+        self._has_further_terms = type(self).further_reward_terms is not Task.further_reward_terms
         self._width = len(self.observation_table)
         self._at = addresses(model, joints)
         self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
@@ -209,15 +210,14 @@ class Task(ABC):
         self._disturb()
         self.simulation.advance(self.num_substeps)
         self._take_rows(1)
-        results, is_over = self._sense(offset, is_clipped)
+        observation, reward, ends, is_over = self._sense(offset, is_clipped)
         sample = self.sample()
-        ends = results.ends
         info = StepInfo({"termination": self._no_reason}, partial(self._describe, sample))
         if is_over:
             info["termination"] = self._reasons(ends)
             self.score()
             info["episode_metrics"] = {**self._metrics.values(), **dict(zip(self._failures, ends, strict=False))}
-        return Transition(results.observed, results.reward, ends[-2], ends[-1], info)
+        return Transition(observation, reward, ends[-2], ends[-1], info)
 
     def observe(self) -> Array:
         """A fresh observation of the present state, (num_worlds, len(observation_table))."""
@@ -362,27 +362,21 @@ class Task(ABC):
             raise self._refused(given.astype(np.float64))
         return offset, is_clipped
 
-    def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[kernels.Results, bool]:
-        """Truth, measurements, score and observation of the control step that has gone by; whether an episode ends."""
+    def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
+        """Observation, reward and ends of the control step that has gone by; whether an episode ends."""
         n = self.num_worlds
-        results = kernels.Results(
-            observed=np.empty((n, self._width)),
-            reward=np.empty(n),
-            ends=np.empty((len(self._failures) + 2, n), dtype=np.bool_),
-        )
-        diverged = self.simulation.diverged()
-        is_over = self._sense_worlds((offset, is_clipped, diverged, self._periods), tuple(results))
+        observed = np.empty((n, self._width))
+        reward = np.empty(n)
+        ends = np.empty((len(self._failures) + 2, n), dtype=np.bool_)
+        commanded = (offset, is_clipped, self.simulation.diverged(), self._periods)
+        is_over = self._sense_worlds(commanded, (observed, reward, ends))
         if self._has_sensors:
-            self._sensors.measure(~diverged, self._sensor_inputs())
-            self._show_sensors(results.observed)
+            self._sensors.measure(~commanded[2], self._sensor_inputs())
+            self._show_sensors(observed)
         if self._has_further_terms:
             for term in self.further_reward_terms(self.sample()).values():
-                results.reward[:] += term
-        return results, is_over
-
-    @property
-    def _has_further_terms(self) -> bool:
-        return type(self).further_reward_terms is not Task.further_reward_terms
+                reward += term
+        return observed, reward, ends, is_over
 
     def _show_sensors(self, observed: Array) -> None:
         """Fill the columns of further sensors."""
