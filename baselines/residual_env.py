@@ -22,15 +22,12 @@ from baselines.residual.features import Features
 from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError, shown
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.core.state import Stateful
 from elastic_env.runtime.envs import final_of, reset_mask
-from elastic_env.runtime.worlds import Transition
+from elastic_env.runtime.task import Transition
 
 
-class _Deciding(Stateful):
+class _Deciding:
     """Base policy, correction and features of some worlds, and their memories."""
-
-    STATE = ("_start", "_fresh", "_state", "_past", "_base")
 
     def __init__(self, env: Any, base: Policy | str, settings: ResidualSettings, num_worlds: int) -> None:
         if not hasattr(env.unwrapped, "assumed_model"):
@@ -40,7 +37,6 @@ class _Deciding(Stateful):
         self.corrected = Corrected(policy, env.unwrapped.assumed_model, settings)
         self.features = Features(self.corrected)
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
-        self._base = policy if hasattr(policy, "get_state") else None  # others keep their memory in `state`
         self._state: Any = None
         self._past: Array | None = None
 
@@ -139,7 +135,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         return self._deciding.observe(self._last[None])[0], total, terminated, truncated, info
 
 
-class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, Any]):
+class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     """Many worlds whose actions are residuals of a base policy, (num_envs, k).
 
     It restarts worlds itself, between decisions only.
@@ -156,8 +152,6 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
     Raises:
         ConfigurationError: Settings that are not valid, or that this base cannot have.
     """
-
-    STATE = ("env", "_deciding", "_rows", "_last", "_done", "_decisions", "_cut_at")
 
     def __init__(
         self,

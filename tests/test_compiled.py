@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,13 +24,13 @@ from rich.console import Console
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
-from elastic_env.dynamics import walk_kernels as kernels
-from elastic_env.runtime import metrics, worlds
+from elastic_env.dynamics import control_kernels as kernels
+from elastic_env.runtime import metrics
 from train.runs.progress import say_what_is_compiled
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
-    "elastic_env.runtime.worlds", "elastic_env.runtime.metrics", "elastic_env.dynamics.walk_kernels",
+    "elastic_env.runtime.metrics", "elastic_env.dynamics.control_kernels",
     "elastic_env.dynamics.tree.kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.tree.end_effector",
     "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
     "baselines.estimation.estimation_kernels", "baselines.adaptation.adaptation_kernels",
@@ -194,15 +194,16 @@ def test_an_interrupt_while_something_is_compiled_is_not_lost() -> None:
 def test_a_testbed_compiles_nothing_once_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a first step, or first steps that are scored, which let a servo wait for the compiler."""
     used: list[Any] = []
-    for owner, name in ((worlds, "_clip"), (metrics, "_add_in_order")):
+    names = ("command", "begin_links", "sense_links", "show_joints")
+    for owner, name in (*((kernels, name) for name in names), (metrics, "_add_in_order")):
         used.append(compiled(getattr(owner, name).py_func))
         monkeypatch.setattr(owner, name, used[-1])
     env = gymnasium.make("elastic_env/Testbed-v0", disable_env_checker=True)
-    assert [len(function.signatures) for function in used] == [1, 1]
+    assert [len(function.signatures) for function in used] == [1] * len(used)
     env.reset(seed=0)
     for k in range(300):
         env.step(np.zeros(1, dtype=(np.float32, np.float64)[k % 2]))
-    assert [len(function.signatures) for function in used] == [1, 1]
+    assert [len(function.signatures) for function in used] == [1] * len(used)
 
 
 def test_division_by_zero_is_as_in_numpy() -> None:
@@ -221,34 +222,44 @@ def test_a_compiled_control_step_does_what_its_python_code_says(scenario: str, m
     """Catches code that is compiled to something else, and what was compiled before a change."""
     worlds = gymnasium.make_vec("elastic_env/WalkInPlace-v0", num_envs=2, scenario=scenario)
     worlds.reset(seed=4)
-    ran: Callable[..., bool] = kernels.control_step
     for _ in range(700):  # into the first swing
         worlds.step(np.zeros((2, 12), dtype=np.float32))
     steps = 0
 
-    def both(physics: Any, walker: Any, noise: Any, *arguments: Any) -> bool:
-        nonlocal steps
-        interpreted = copy.deepcopy((physics, walker, noise, *arguments))
-        is_over = ran(physics, walker, noise, *arguments)
-        with pytest.MonkeyPatch.context() as uncompiled:
-            for name, function in vars(kernels).items():
-                if hasattr(function, "py_func"):
+    def compared(ran: Any) -> Callable[..., Any]:
+        def both(*arguments: Any) -> Any:
+            nonlocal steps
+            interpreted = copy.deepcopy(arguments)
+            found = ran(*arguments)
+            with pytest.MonkeyPatch.context() as uncompiled:
+                for name, function in compiled_ones.items():
                     uncompiled.setattr(kernels, name, function.py_func)
-            assert ran.py_func(*interpreted) == is_over  # type: ignore[attr-defined]
-        (rows, outcome), (plain_rows, plain) = arguments[-2:], interpreted[-2:]
-        outcome, plain = kernels.Outcome(*outcome), kernels.Outcome(*plain)
-        for mine, expected in ((rows, plain_rows), (outcome.observed, plain.observed)):
-            np.testing.assert_allclose(mine.view(np.float64), expected.view(np.float64), rtol=1e-13, atol=1e-13)
-        np.testing.assert_allclose(outcome.reward, plain.reward, rtol=1e-13)
-        np.testing.assert_array_equal(outcome.ends, plain.ends)
-        np.testing.assert_array_equal(kernels.Noise(*noise).used, kernels.Noise(*interpreted[2]).used)
-        steps += 1
-        return is_over
+                assert ran.py_func(*interpreted) == found
+            for mine, expected in zip(_arrays(arguments), _arrays(interpreted), strict=True):
+                np.testing.assert_allclose(mine, expected, rtol=1e-13, atol=1e-13)
+            steps += 1
+            return found
 
-    monkeypatch.setattr(kernels, "control_step", both)
+        return both
+
+    compiled_ones = {name: function for name, function in vars(kernels).items() if hasattr(function, "py_func")}
+    for name in ("command", "sense_walk"):
+        monkeypatch.setattr(kernels, name, compared(compiled_ones[name]))
     for k in range(20):
         worlds.step(np.full((2, 12), 0.01 * np.sin(k), dtype=np.float32))
-    assert steps == 20
+    assert steps == 40
+
+
+def _arrays(value: Any) -> Iterator[Any]:
+    """All numbers of arguments of kernels."""
+    if isinstance(value, tuple):
+        for part in value:
+            yield from _arrays(part)
+    elif isinstance(value, np.ndarray) and value.dtype.names:
+        for name in value.dtype.names:
+            yield from _arrays(value[name])
+    elif value is not None:
+        yield np.asarray(value)
 
 
 PLAYED = """

@@ -17,9 +17,9 @@ from baselines.compensation.contact_torque import PlannedTorque, WrenchTorque, g
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.dynamics.control_kernels import attitude_of
 from elastic_env.dynamics.floating_body import FloatingBody
 from elastic_env.dynamics.leg_kinematics import foot_pose
-from elastic_env.dynamics.walk_kernels import attitude_of
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS

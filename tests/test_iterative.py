@@ -201,7 +201,7 @@ def test_a_drawn_motion_repeats_with_its_robot() -> None:
         for seed, options in ((5, None), (8, {"robot_seed": 5}), (8, None)):
             env.reset(seed=seed, options=options)
             task = env.unwrapped.task
-            told.append(task._reference._motion[0].copy())
+            told.append(task._reference.motion[0].copy())
         assert np.array_equal(told[0], told[1])
         assert not np.array_equal(told[0], told[2])
 

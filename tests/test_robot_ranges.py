@@ -25,6 +25,7 @@ from elastic_env.robots.thormang.environment import make_vector as make_walk_vec
 from elastic_env.robots.thormang.model import DRAWN_LOAD, add_load, elastic_spec
 from elastic_env.runtime.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
 from elastic_env.runtime.sensors import InertialSensor
+from tests.three_joints import ARM
 
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
 MASS_KG = 57.0
@@ -205,8 +206,6 @@ def test_what_ranges_draw_is_not_said_twice() -> None:
         make_scenario("sensor+drawn")
     with pytest.raises(ConfigurationError, match="sets ranges a second time"):
         make_scenario("drawn+drawn_beyond")
-    with pytest.raises(ConfigurationError, match="ranges, which only a walker knows"):
-        gymnasium.make("elastic_env/Testbed-v0", scenario="drawn")
     assert make_scenario("soft+drawn").stiffness_scale == 0.7
     assert make_scenario("drawn").draws_robots
 
@@ -501,3 +500,66 @@ def test_the_table_of_ranges_is_that_of_the_code() -> None:
         assert table.pop(name) == (drawn, "1, where `push_n` is beyond" if name == "push_share" else
                                    "; ".join(beyond.get(name, []))), name  # fmt: skip
     assert set(table) == {"drawn", "drawn_beyond"}  # of the table of figures
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_joint_on_a_fixed_base_is_what_was_drawn(num_envs: int) -> None:
+    """Catches a quantity that is drawn and does not reach the physics, and a load or a push of a walker's."""
+    env: Any = gymnasium.make_vec(
+        "elastic_env/Testbed-v0", num_envs=num_envs, scenario="drawn", vectorization_mode="vector_entry_point"
+    ).unwrapped
+    env.reset(seed=4)
+    known = env.assumed_model
+    plain = env.task.model
+    springs = [plain.tendon("joint_spring").id]
+    link = plain.joint("joint").dofadr[0]
+    ranges = TRAINING_RANGES.on_fixed_base()
+    for world in range(num_envs):
+        robot = robot_of(env, world)
+        assert is_within(ranges, robot)
+        assert env.task.robot_record(world)["robot_load_kg"] == env.task.robot_record(world)["robot_push_n"] == 0.0
+        model = env.simulation.model_of(world)
+        stiffness = known.stiffness * robot.stiffness_factor
+        np.testing.assert_allclose(model.tendon_stiffness[springs], stiffness, rtol=1e-12)
+        np.testing.assert_allclose(env.truth().stiffness[world], stiffness, rtol=1e-12)
+        np.testing.assert_allclose(model.tendon_damping[springs], known.damping * robot.damping_factor, rtol=1e-12)
+        dead_band = np.diff(model.tendon_lengthspring[springs], axis=1)[:, 0]
+        np.testing.assert_allclose(dead_band, known.backlash + robot.backlash_rad, atol=1e-12)
+        friction = known.coulomb_friction[0] * robot.friction_factor
+        assert model.dof_frictionloss[link] == pytest.approx(friction, rel=1e-12)
+
+
+def test_drawn_robots_on_a_fixed_base_begin_at_rest() -> None:
+    """Catches a robot that is placed by the K or the dead band of another one, and a homing error with another sign."""
+    envs = [
+        gymnasium.make_vec(
+            "elastic_env/Testbed-v0", num_envs=4, scenario=scenario, vectorization_mode="vector_entry_point"
+        )
+        for scenario in ("ideal+drawn", "ideal+drawn_beyond")
+    ]
+    for env in envs:
+        observation, info = env.reset(seed=1)
+        robots = [robot_of(env, world) for world in range(4)]
+        truth: Any = env.unwrapped.truth()  # type: ignore[attr-defined]
+        bias = [robot.encoder_bias_rad[0] for robot in robots]
+        np.testing.assert_allclose(observation[:, 0] - truth.theta[:, 0], bias, atol=1e-12)
+        for _ in range(25):
+            *_, later = env.step(np.zeros((4, 1), np.float32))
+        np.testing.assert_allclose(later["link_angle"], info["link_angle"], atol=1e-6)
+
+
+def test_an_arm_is_drawn_alone_as_among_others() -> None:
+    """Catches a robot that depends on the number of worlds, and measurements that are delayed in all worlds or none."""
+    ARM.register()
+    many = gymnasium.make_vec(
+        "elastic_env/Arm-v0", num_envs=8, scenario="drawn", vectorization_mode="vector_entry_point"
+    )
+    alone = gymnasium.make("elastic_env/Arm-v0", scenario="drawn", disable_env_checker=True)
+    first, _ = many.reset(seed=3)
+    own, _ = alone.reset(seed=8)
+    np.testing.assert_array_equal(first[5], own)
+    assert {robot_of(many, world).is_delayed for world in range(8)} == {False, True}
+    for _ in range(20):
+        first, *_ = many.step(np.full((8, 3), 0.01, np.float32))
+        own, *_ = alone.step(np.full(3, 0.01, np.float32))
+    np.testing.assert_array_equal(first[5], own)

@@ -1,17 +1,13 @@
-"""The info that is computed when it is looked at, against a plain dictionary; records of rows."""
+"""The info that is computed when it is looked at, against a plain dictionary."""
 
 import copy
 import json
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pytest
 
-from elastic_env.core.rows import Rows
-from elastic_env.core.signals import Array
 from elastic_env.runtime.step_info import StepInfo
 
 PLAIN = {"given": 1, "other": 2, "late": 3, "later": 4}
@@ -89,30 +85,3 @@ def test_a_key_that_is_nowhere_is_an_error() -> None:
     for _ in range(2):
         with pytest.raises(KeyError, match="none"):
             lazy["none"]
-
-
-@dataclass(frozen=True)
-class Inner(Rows):
-    """A record in a record."""
-
-    x: Array
-
-
-@dataclass(frozen=True)
-class Outer(Rows):
-    """A record of two rows."""
-
-    inner: Inner
-    y: Array
-
-
-def test_records_are_chosen_and_joined_row_by_row() -> None:
-    """Catches a nested record that is left out, rows of the wrong record, and records joined in another order."""
-    one = Outer(Inner(np.array([[1.0, 2.0], [3.0, 4.0]])), np.array([5, 6]))
-    other = Outer(Inner(-one.inner.x), -one.y)
-    mixed = one.with_worlds(np.array([False, True]), other)
-    np.testing.assert_array_equal(mixed.inner.x, [[1.0, 2.0], [-3.0, -4.0]])
-    np.testing.assert_array_equal(mixed.y, [5, -6])
-    joined = Outer.joined([one, other, one])
-    np.testing.assert_array_equal(joined.inner.x, np.concatenate([one.inner.x, -one.inner.x, one.inner.x]))
-    np.testing.assert_array_equal(joined.y, [5, 6, -5, -6, 5, 6])

@@ -124,10 +124,11 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
     task = env.unwrapped.task
     address = task.model.joint("joint").dofadr[0]
 
-    def disturb(simulation: Any) -> None:
-        simulation.bind("qfrc_applied")[:, address] = -6.0 if task._step[0] >= 200 else 0.0
+    def disturb() -> None:
+        is_late = task.sample().worlds["truth"]["step"][0] >= 200
+        task.simulation.bind("qfrc_applied")[:, address] = -6.0 if is_late else 0.0
 
-    task.disturb = disturb
+    task._disturb = disturb
     errors, states, _ = played(baselines.make("disturbance_observer", env, observer=ObserverGains(friction=False)), env)
     uncompensated, _, _ = played(baselines.make("dynamic", env), env)
     assert uncompensated[-1, 0] == pytest.approx(6.0 / 1061.0, rel=0.02)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.walk_kernels import tilt_penalty, zmp_penalty
+from elastic_env.dynamics.control_kernels import tilt_penalty, zmp_penalty
 from elastic_env.joint.joint_names import spring_name
 from elastic_env.robots.thormang import config as walk_config
 from elastic_env.robots.thormang import task as walk_in_place

@@ -82,6 +82,12 @@ class RobotRanges(Model):
                 )
         return self
 
+    def on_fixed_base(self) -> Self:
+        """The same for a robot that does not walk, which has no torso to load or to push, and no floor."""
+        nominal = RobotRanges()
+        names = ("load_kg", "load_x_m", "load_y_m", "load_z_m", "slope_rad", "push_n", "inertial_share")
+        return self.replace(**{name: getattr(nominal, name) for name in names})
+
     def intervals(self) -> Iterator[tuple[str, Interval]]:
         """Quantities with an interval, by name."""
         for name in type(self).model_fields:
@@ -152,6 +158,13 @@ def draw_robots(ranges: Sequence[RobotRanges], number: int, joints: int, seed: S
         for index, own in enumerate(ranges)
         for robot in _drawn(own, ends[index + 1] - ends[index], joints, (*seed, index))
     ]
+
+
+def draw_robot(ranges: Sequence[RobotRanges], joints: int, generator: np.random.Generator) -> RobotDraw:
+    """One robot of ranges, which have equal chances where there are several."""
+    own = ranges[int(generator.integers(len(ranges)))]
+    (robot,) = _drawn(own, 1, joints, [int(generator.integers(2**63))])
+    return robot
 
 
 def latin_hypercube(number: int, columns: int, generator: np.random.Generator) -> Array:

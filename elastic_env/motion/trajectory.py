@@ -6,9 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.rows import Rows
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.core.state import Stateful
 
 STAND_S = 1.0
 """Time at the first position in which policies ramp in; not scored."""
@@ -92,17 +90,6 @@ def control_times(duration_s: float, control_period_s: float) -> Array:
     return np.arange(round(duration_s / control_period_s) + 1) * control_period_s
 
 
-@dataclass(frozen=True, slots=True)
-class PlanRow(Rows):
-    """The reference of every world at its present step, (num_worlds, n), scored and rest (num_worlds,); see `Plan`."""
-
-    q: Array
-    q_dot: Array
-    q_ddot: Array
-    scored: BoolArray
-    rest: IntArray
-
-
 class Planned(Protocol):
     """A reference, which makes plans of one length."""
 
@@ -116,16 +103,19 @@ class Planned(Protocol):
         ...
 
 
-class PlanTable(Stateful):
+class PlanTable:
     """The plans of all worlds as tables, one row per control step; a plan without randomness is held once.
 
     Args:
         reference: Makes plans of all joints, (T, n).
         control_period_s: Time between commands [s].
         num_worlds: How many.
-    """
 
-    STATE = ("_motion",)
+    Attributes:
+        motion: Angle, rate and acceleration of all joints, a plan after the other, (plans, T, 3, n).
+        plan_of_world: Which plan each world follows, (num_worlds,).
+        scored, rest: As in a `Plan`, the same for all, (T,).
+    """
 
     def __init__(self, reference: Planned, control_period_s: float, num_worlds: int) -> None:
         self._reference, self._period = reference, control_period_s
@@ -137,21 +127,15 @@ class PlanTable(Stateful):
                 f"of {control_period_s} s; lengthen it"
             )
         self._is_shared = not reference.is_random
-        self._row = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
-        rows = 1 if self._is_shared else num_worlds
-        self._motion = np.tile(_stacked(probe), (rows, 1, 1, 1))
-        self._scored, self._rest = probe.scored, probe.rest
+        self.plan_of_world = np.zeros(num_worlds, dtype=np.int64) if self._is_shared else np.arange(num_worlds)
+        self.motion = np.tile(_stacked(probe), (1 if self._is_shared else num_worlds, 1, 1, 1))
+        self.scored = probe.scored
+        self.rest = probe.rest
 
     def draw(self, world: int, generator: np.random.Generator) -> None:
         """A new plan for one world."""
         if not self._is_shared:
-            self._motion[world] = _stacked(self._reference.plan(generator, self._period))
-
-    def at(self, step: IntArray) -> PlanRow:
-        """Rows of the given steps, (num_worlds,); beyond the end the last row."""
-        row = np.minimum(step, self.num_steps)
-        motion = self._motion[self._row, row]
-        return PlanRow(motion[:, 0], motion[:, 1], motion[:, 2], self._scored[row], self._rest[row])
+            self.motion[world] = _stacked(self._reference.plan(generator, self._period))
 
 
 def _stacked(plan: Plan) -> Array:

@@ -38,9 +38,10 @@ from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
 from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
 from elastic_env.runtime.joint_config import JointConfig, RewardWeights, require_torque
-from elastic_env.runtime.joint_task import ACTION_BOUND_RAD, JointPlant, JointTask
+from elastic_env.runtime.joint_task import JointPlant, JointTask
 from elastic_env.runtime.robot_model import RobotModel, read_stiffness, with_stiffness
 from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.runtime.task import ACTION_BOUND_RAD
 
 _WIDTH, _HEIGHT = 640, 480
 _ENLARGED = 8.0
@@ -242,10 +243,12 @@ class JointPicture(ModelPicture):
     def sides(self, now: Mapping[str, float], world: int = 0) -> Sides:  # noqa: ARG002  the truth has every joint
         """See `HasSides`."""
         truth = self._task.truth()
-        return Sides(self._task.sample().q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
+        q_ref = self._task.sample().joints["truth"]["q_ref"]
+        return Sides(q_ref[world].copy(), truth.theta[world].copy(), truth.q[world].copy())
 
     def _pose(self, now: dict[str, float], world: int) -> None:  # noqa: ARG002  the truth has every joint
-        q, q_ref = self._task.truth().q[world], self._task.sample().q_ref[world]
+        q = self._task.truth().q[world]
+        q_ref = self._task.sample().joints["truth"]["q_ref"][world]
         drawn = q_ref + _ENLARGED * (q - q_ref)
         for name, angle, reference in zip(self._joints, drawn, q_ref, strict=True):
             self._data.joint(name).qpos, self._data.joint(_REFERENCE + name).qpos = angle, reference
@@ -352,11 +355,19 @@ def _require_in_range(config: JointRobotConfig, robot: RobotModel, q: Array) -> 
             )
 
 
-def _rest_angle(command: Array, factor: Parameter = 1.0, *, form: str, true: RobotModel, body: TreeTorque) -> Array:
+def _rest_angle(
+    command: Array,
+    factor: Parameter = 1.0,
+    backlash: Array | None = None,
+    *,
+    form: str,
+    true: RobotModel,
+    body: TreeTorque,
+) -> Array:
     """Link angles at rest without friction: a dead band is crossed to the side to which the load pulls."""
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return command
-    engaged = command - np.sign(body.gravity_torque(command)) * true.backlash / 2.0
+    engaged = command - np.sign(body.gravity_torque(command)) * (true.backlash if backlash is None else backlash) / 2.0
     finite = np.minimum(stiffness, _RIGID_NM_PER_RAD)
     return static_link_angle(engaged, finite, body.gravity_torque, body.gravity_gradient, unique=False)

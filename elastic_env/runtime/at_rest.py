@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.motion.trajectory import PlanRow
 
 _SHARE = 0.004
 """Motion within a window that is worth a word, over the sag. An error of 2 % that fades by 1/s moves by as much."""
@@ -17,6 +16,9 @@ _SMALLEST_RAD = 1e-5
 class RestWatch:
     """Warns once where links still move in a window at rest, and no policy moves them.
 
+    Attributes:
+        is_said: Whether it has warned.
+
     Args:
         static_torque: τ_g that holds the links, from (..., n) [rad] to (..., n) [N·m].
         stiffness: Of spring and servo together, (n,) [N·m/rad].
@@ -25,7 +27,7 @@ class RestWatch:
 
     def __init__(self, static_torque: Callable[[Array], Array], stiffness: Array, joints: Sequence[str]) -> None:
         self._static_torque, self._stiffness, self._joints = static_torque, stiffness, list(joints)
-        self._is_said = False
+        self.is_said = False
         self._window: IntArray = np.empty(0, dtype=np.int64)
         self._least: Array = np.empty(0)
         self._most: Array = np.empty(0)
@@ -35,28 +37,28 @@ class RestWatch:
         if self._window.shape == worlds.shape:
             self._window[worlds] = -1
 
-    def see(self, reference: PlanRow, is_last: BoolArray, q: Array, offset: Array) -> None:
+    def see(self, rest: IntArray, is_last: BoolArray, q_ref: Array, q: Array, offset: Array) -> None:
         """Look at a control step.
 
         Args:
-            reference: Of this step, with the number of the window at rest, −1 elsewhere.
+            rest: Number of the window at rest, −1 elsewhere, (num_worlds,).
             is_last: Whether the window ends with this step, (num_worlds,).
-            q: Link angles, (num_worlds, n) [rad].
-            offset: Command offsets, (num_worlds, n) [rad].
+            q_ref: References, (num_worlds, n) [rad].
+            q: Link angles, likewise.
+            offset: Command offsets, likewise.
         """
-        rest = reference.rest
-        if self._is_said or not (rest >= 0).any():
-            return
         now = np.stack([q, offset])
         if self._window.shape != rest.shape:
-            self._window, self._least, self._most = np.full(rest.shape, -1), now.copy(), now.copy()
+            self._window = np.full(rest.shape, -1)
+            self._least = now.copy()
+            self._most = now.copy()
         fresh = rest != self._window
         self._least = np.where(fresh[:, None], now, np.minimum(self._least, now))
         self._most = np.where(fresh[:, None], now, np.maximum(self._most, now))
         ended = (rest >= 0) & is_last
         self._window = np.where(ended, -1, rest)
         if ended.any():
-            self._judge(reference.q[ended], (self._most - self._least)[:, ended], rest[ended])
+            self._judge(q_ref[ended], (self._most - self._least)[:, ended], rest[ended])
 
     def _judge(self, q_ref: Array, moved: Array, window: IntArray) -> None:
         """Warn of windows that end; `moved` is by how much links and commands moved within them, (2, ended, n)."""
@@ -65,7 +67,7 @@ class RestWatch:
         restless = (links > np.maximum(_SHARE * sag, _SMALLEST_RAD)) & (commands < links / 2.0)
         if not restless.any():
             return
-        self._is_said = True
+        self.is_said = True
         worst = int(np.argmax(np.where(restless, links, 0.0)))
         joint = self._joints[int(moved[0, worst].argmax())]
         warnings.warn(

@@ -12,16 +12,14 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from elastic_env.core.draws import Draws
+from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
-from elastic_env.core.state import Stateful
 from elastic_env.rendering.picture import Picture
 from elastic_env.runtime.physics import Simulation
 from elastic_env.runtime.robot_model import RobotModel
 from elastic_env.runtime.step_info import StepInfo
-from elastic_env.runtime.task import Task
-from elastic_env.runtime.worlds import Transition, Worlds
+from elastic_env.runtime.task import Task, Transition
 
 Observation: TypeAlias = npt.NDArray[Any]
 Action: TypeAlias = npt.NDArray[Any]
@@ -30,9 +28,10 @@ RENDER_MODES = ("rgb_array", "human")
 
 
 class _Faces:
-    """What both environments show of their worlds."""
+    """What both environments show of their task."""
 
-    _worlds: Worlds
+    task: Task
+    """The rules of this environment."""
     _picture: Picture | None = None
     _make_picture: Callable[[], Picture] | None = None
     _spec: EnvSpec | None = None
@@ -51,21 +50,16 @@ class _Faces:
     @property
     def assumed_model(self) -> RobotModel:
         """What a compensator may know of the robot."""
-        return self._worlds.task.assumed_model
-
-    @property
-    def task(self) -> Task:
-        """The rules of this environment."""
-        return self._worlds.task
+        return self.task.assumed_model
 
     @property
     def simulation(self) -> Simulation:
         """The physics, for benchmarks and tests; a policy has no business here."""
-        return self._worlds.simulation
+        return self.task.simulation
 
     def truth(self) -> Any:
         """Noise-free state and true parameters: for scoring and the `oracle` policy, nothing else."""
-        return self._worlds.task.truth()
+        return self.task.truth()
 
     @property
     def picture(self) -> Picture:
@@ -78,7 +72,7 @@ class _Faces:
 
     def _let_go(self) -> None:
         """Close the window, free the renderer, let hardware go."""
-        self._worlds.simulation.close()
+        self.task.simulation.close()
         if self._picture is not None:
             self._picture.close()
             self._picture = None
@@ -115,7 +109,8 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
         self.render_mode = render_mode
         self.observation_space = task.observation_table.space(np.float64)
         self.action_space = task.action_table.space(np.float32)
-        self._worlds = Worlds(task, num_threads=1, is_scalar=True, simulation=simulation)
+        self.task = task
+        task.attach(simulation, num_threads=1, is_scalar=True)
         self._make_picture = picture
         self._steps_per_frame = max(round(1.0 / (self.metadata["render_fps"] * task.assumed_model.control_period_s)), 1)
         self._steps = 0
@@ -125,14 +120,14 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode, with options["robot_seed"] = s of the robot, and motion, that `reset(seed=s)` draws."""
         super().reset(seed=seed, options=options)
-        self._worlds.restart(np.ones(1, dtype=np.bool_), _draws([self.np_random], _robot_seeds(options, 1)))
+        self.task.restart(np.ones(1, dtype=np.bool_), _episodes([self.np_random], _robot_seeds(options, 1)))
         self._steps = 0
         self._render_human()
-        return self._worlds.task.observe()[0], _first(self._worlds.signals())
+        return self.task.observe()[0], _first(self.task.signals())
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control period under a command offset [rad]."""
-        result = self._worlds.step(np.asarray(action)[None])
+        result = self.task.step(np.asarray(action)[None])
         self._steps += 1
         self._render_human()
         return (
@@ -145,7 +140,7 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
     def render(self) -> Any:
         """The present picture as an RGB array, (height, width, 3) uint8; None in the other modes."""
-        return self._draw().rgb(self._worlds.signals()) if self.render_mode == "rgb_array" else None
+        return self._draw().rgb(self.task.signals()) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
         """Close the window, free the renderer, let hardware go."""
@@ -153,11 +148,11 @@ class ElasticEnv(_Faces, gymnasium.Env[Observation, Action]):  # pyright: ignore
 
     def _render_human(self) -> None:
         if self.render_mode == "human" and self._steps % self._steps_per_frame == 0:
-            self._draw().show(self._worlds.signals())
+            self._draw().show(self.task.signals())
 
 
 class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  `spec` is a property
-    _Faces, Stateful, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
+    _Faces, gymnasium.vector.VectorEnv[Observation, Action, npt.NDArray[Any]]
 ):
     """Many worlds of a task on a thread pool.
 
@@ -172,8 +167,6 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         render_mode: "rgb_array" or None.
         picture: Makes the picture of the task when it is first rendered.
     """
-
-    STATE = ("_worlds", "_generators", "_done")
 
     def __init__(
         self,
@@ -196,7 +189,8 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self.single_action_space = task.action_table.space(np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._worlds = Worlds(task, num_threads, simulation=simulation)
+        self.task = task
+        task.attach(simulation, num_threads)
         self._generators = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._done = np.zeros(self.num_envs, dtype=np.bool_)
 
@@ -214,7 +208,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
             if seeds[world] is not None:
                 self._generators[world] = seeding.np_random(seeds[world])[0]
         self._begin(mask, robots)
-        return self._worlds.task.observe(), self._worlds.signals()
+        return self.task.observe(), self.task.signals()
 
     def step(
         self, actions: Action
@@ -224,7 +218,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         some_restart = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(restarting.any())
         if some_restart and given.shape == self.action_space.shape:
             given = np.where(restarting[:, None], 0.0, given)
-        result = self._worlds.step(given)
+        result = self.task.step(given)
         if some_restart:
             result = self._restarted_instead(result, restarting)
         self._done = done = result.done
@@ -245,7 +239,7 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         """The present picture of every world, (height, width, 3) uint8, which takes some 20 ms each."""
         if self.render_mode is None:
             return None
-        signals = self._worlds.signals()
+        signals = self.task.signals()
         return tuple(self._draw().rgb(signals, world) for world in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002  Gymnasium's signature
@@ -253,27 +247,25 @@ class ElasticVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]  
         self._let_go()
 
     def _begin(self, worlds: BoolArray, robots: Sequence[int | None] | None = None) -> None:
-        self._worlds.restart(worlds, _draws(self._generators, robots or [None] * self.num_envs))
+        self.task.restart(worlds, _episodes(self._generators, robots or [None] * self.num_envs))
         self._done = self._done & ~worlds
 
     def _restarted_instead(self, result: Transition, worlds: BoolArray) -> Transition:
         """NEXT_STEP: the worlds that ended in the last step begin anew in this one, which counts for nothing."""
         self._begin(worlds)
-        fresh = self._worlds.signals()
+        fresh = self.task.signals()
         info = _restarted_info(result.info, worlds, fresh)
         terminated, truncated = result.terminated & ~worlds, result.truncated & ~worlds
         if not (terminated | truncated).any():  # what ended had ended before
             info = _without_metrics(info)
-        return Transition(
-            self._worlds.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info
-        )
+        return Transition(self.task.observe(), np.where(worlds, 0.0, result.reward), terminated, truncated, info)
 
     def _restarted_after(self, result: Transition) -> tuple[Array, dict[str, Any]]:
         """SAME_STEP: the worlds that end begin anew at once; their last observation and info are kept beside."""
         final = final_of(result.observation, _with_mask(result.info, result.done), result.done)
         self._begin(result.done)
-        info = _without_metrics(_restarted_info(result.info, result.done, self._worlds.signals()))
-        return self._worlds.task.observe(), info | final
+        info = _without_metrics(_restarted_info(result.info, result.done, self.task.signals()))
+        return self.task.observe(), info | final
 
 
 def final_of(observation: Array, info: dict[str, Any], done: BoolArray) -> dict[str, Any]:
@@ -284,10 +276,10 @@ def final_of(observation: Array, info: dict[str, Any], done: BoolArray) -> dict[
     return {"final_obs": last, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}
 
 
-def _draws(generators: Sequence[np.random.Generator], robots: Sequence[int | None]) -> list[Draws]:
+def _episodes(generators: Sequence[np.random.Generator], robots: Sequence[int | None]) -> list[EpisodeRandom]:
     """Generators of new episodes, of new robots or of those that some seeds draw."""
     return [
-        Draws(own) if seed is None else Draws(seeding.np_random(seed)[0], own)
+        EpisodeRandom(own) if seed is None else EpisodeRandom(seeding.np_random(seed)[0], own)
         for own, seed in zip(generators, robots, strict=True)
     ]
 

@@ -20,16 +20,15 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from elastic_env.core.draws import Draws
+from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
-from elastic_env.core.state import Stateful
 from elastic_env.runtime.scenario import Scenario
 from elastic_env.runtime.sensors import NoiseStream, angle_of_count, quantise
 
 
 @dataclass(frozen=True)
-class Felt:
+class SensorInputs:
     """What sensors need of the truth of a task, one row per world.
 
     Attributes:
@@ -59,7 +58,7 @@ class Sensor:
 
     unit: str
     meaning: str
-    truth: Callable[[Felt], Array]
+    truth: Callable[[SensorInputs], Array]
     axes: Mapping[str, Mirrored] | None = None
     noise: float = 0.0
     offset: float = 0.0
@@ -92,13 +91,15 @@ def add_accelerometer(spec: mujoco.MjSpec, site: str) -> None:
     )
 
 
-def specific_force(model: mujoco.MjModel, sensordata: Array) -> Array:
-    """The accelerometer's columns of `sensordata`, (num_worlds, 3) [m/s²]."""
+def specific_force(model: mujoco.MjModel, sensordata: Array | None, num_worlds: int) -> Array:
+    """The accelerometer's columns of `sensordata`, (num_worlds, 3) [m/s²]; nan without these."""
+    if sensordata is None:
+        return np.full((num_worlds, 3), np.nan)
     begin = int(model.sensor(ACCELEROMETER).adr[0])
     return sensordata[:, begin : begin + 3].copy()
 
 
-class FurtherSensors(Stateful):
+class FurtherSensors:
     """What some sensors of all worlds show.
 
     Args:
@@ -110,8 +111,6 @@ class FurtherSensors(Stateful):
     Raises:
         ConfigurationError: There is no such sensor.
     """
-
-    STATE = ("_noise", "_offset", "_now", "_before")
 
     def __init__(
         self,
@@ -135,11 +134,7 @@ class FurtherSensors(Stateful):
         self._offset = {group.name: np.zeros((num_worlds, *group.shape)) for group in groups}
         self._now = self._before = np.zeros((num_worlds, len(self.signals)))
 
-    def __bool__(self) -> bool:
-        """Whether there is any."""
-        return bool(self._sensors)
-
-    def restart(self, worlds: BoolArray, draws: Sequence[Draws], truth: Felt) -> None:
+    def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom], truth: SensorInputs) -> None:
         """Draw the offsets of new episodes, and measure."""
         if self._noise is None:
             return
@@ -147,12 +142,12 @@ class FurtherSensors(Stateful):
             for name, sensor in self._sensors.items():
                 offset = self._offset[name]
                 width = self._homing_rad[world] if sensor.is_encoder else self._scale[world] * sensor.offset
-                offset[world] = width * draws[world].robot.uniform(-1.0, 1.0, offset.shape[1])
-            self._noise.restart(world, draws[world].noise())
+                offset[world] = width * random[world].robot.uniform(-1.0, 1.0, offset.shape[1])
+            self._noise.restart(world, random[world].noise())
         self.measure(worlds, truth)
         self._before = np.where(worlds[:, None], self._now, self._before)
 
-    def measure(self, worlds: BoolArray, truth: Felt) -> None:
+    def measure(self, worlds: BoolArray, truth: SensorInputs) -> None:
         """Take new values in some worlds; the others keep theirs."""
         if self._noise is None:
             return

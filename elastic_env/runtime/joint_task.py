@@ -7,42 +7,44 @@ the deflections, of the servo errors and of the offsets' rates, largest joint to
 """
 
 import copy
-import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from elastic_env.core.draws import Draws
+from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.rows import Rows
-from elastic_env.core.signals import Array, BoolArray, IntArray, Kind, Signal, SignalGroup, Signals, SignalTable
-from elastic_env.core.state import Stateful
+from elastic_env.core.robot_ranges import RobotDraw, draw_robot
+from elastic_env.core.signals import Array, BoolArray, Signal, Signals
+from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.dynamics.tree.end_effector import EndEffector
-from elastic_env.joint.elasticity import joint_torque
-from elastic_env.joint.joint_names import JointAddresses, servo_name, spring_name
+from elastic_env.joint.joint_names import spring_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
 from elastic_env.runtime.at_rest import RestWatch
-from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
+from elastic_env.runtime.further_sensors import FurtherSensors, SensorInputs
 from elastic_env.runtime.joint_config import JointConfig
 from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
+from elastic_env.runtime.physics import DIVERGED_RAD_S
 from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.runtime.rows import COURSE, REAL, RULES, WHOLE, Records, Sample, one, record_type
 from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import NoiseStream, PendulumImu, angle_of_count, attitude, is_due, quantise
-from elastic_env.runtime.task import Outcome
-
-ACTION_BOUND_RAD = 0.3
-"""Largest command offset [rad]."""
+from elastic_env.runtime.sensors import PendulumImu, angle_of_count, is_due
+from elastic_env.runtime.task import Task, joint_groups, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"
 """Name by which `sensors=[...]` asks for it, on a robot of one joint; its errors are those of the scenario's IMU."""
 
-NOISE = np.dtype([("imu", np.float64)])
-"""A sample of noise [1]."""
+_SCORES = record_type(("link_error", REAL), ("command_rate", REAL), ("divergence", REAL))
+_TRUTH = record_type(*COURSE, ("scored", np.bool_), ("rest", WHOLE))  # as in a `Plan`
+_SHOWN = record_type(("imu", REAL), ("visible_imu", REAL))  # link angle now, and as old as the scenario has it [rad]
+_CONSTANTS = record_type(
+    ("weights", _SCORES), ("imu_noise_rad", REAL), ("imu_bias_rad", REAL), ("imu_sine_error_rad", REAL)
+)
+_SCHEDULE = record_type(("scored", np.bool_), ("rest", WHOLE), ("imu_is_due", np.bool_))
 
 _OF_EVERY_STEP = (
     *(Metric(f"command_rate_{s}_rad_s", "command_rate", s, over="all") for s in ("rms", "peak")),
@@ -81,7 +83,7 @@ class JointPlant:
         assumed, true: What a compensator may know, and what is; without a table of observations.
         static_torque: τ_g that holds the true links, from (..., n) [rad] to (..., n) [N·m].
         rest_angle: Link angles at rest without friction, from the servos' commands, (..., n) [rad], and if they differ
-            from the true ones the springs' factors, (..., n) [1].
+            from the true ones the springs' factors, (..., n) [1], and the dead bands, (..., n) [rad].
         motion: The reference as all joints follow it.
         imu_arm_m: Distance of the link's IMU from the only joint, which has a horizontal axis and a link that hangs at
             q = 0 [m]; None where there is no such IMU.
@@ -105,7 +107,7 @@ class JointPlant:
 
 
 @dataclass(frozen=True)
-class JointTruth(Felt):
+class JointTruth(SensorInputs):
     """Noise-free state of the joints and their true parameters, one row per world. For scoring and the oracle.
 
     Attributes:
@@ -123,99 +125,8 @@ class JointTruth(Felt):
     model: RobotModel
 
 
-@dataclass(frozen=True, slots=True)
-class JointState(Rows):
-    """Motor and link side of the joints, (num_worlds, n) each [rad], [rad/s]."""
-
-    theta: Array
-    theta_dot: Array
-    q: Array
-    q_dot: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Measurement(Rows):
-    """Sensor values, (num_worlds, n) each [rad]; the encoders also a control period earlier."""
-
-    encoder: Array
-    encoder_before: Array
-    imu: Array
-
-
-@dataclass(frozen=True, slots=True)
-class JointSample(Rows):
-    """What a step is scored by, one row per world.
-
-    Attributes:
-        step: Control steps since the start of the episode, (rows,).
-        q_ref: Reference, (rows, n) [rad].
-        scored, rest: Whether the step counts in metrics; number of the window at rest, −1 elsewhere, (rows,).
-        state: Of the joints.
-        imu: Link angles as IMUs show them, (rows, n) [rad].
-        servo_error: θ_cmd − θ, (rows, n) [rad].
-        command_rate: Rate of change of the offsets, (rows, n) [rad/s].
-        stiffness: True K, (rows, n) [N·m/rad].
-        diverged: Whether the world has no new state, (rows,).
-    """
-
-    step: IntArray
-    q_ref: Array
-    scored: BoolArray
-    rest: IntArray
-    state: JointState
-    imu: Array
-    servo_error: Array
-    command_rate: Array
-    stiffness: Array
-    diverged: BoolArray
-
-
-def tracking_penalty(link_error: Array) -> Array:
-    """−|q_ref − q| [rad], the rms over several joints: linear, so that a large error never stops to matter."""
-    return -over_joints(link_error)
-
-
-def smoothness_penalty(command_rate: Array) -> Array:
-    """−|ȧ|, the rate of change of the command offset, the rms over several joints [rad/s]."""
-    return -over_joints(command_rate)
-
-
-def divergence_penalty(diverged: BoolArray) -> Array:
-    """−1 in the step in which the simulation diverges."""
-    return -diverged.astype(np.float64)
-
-
-def over_joints(values: Array) -> Array:
-    """One magnitude for all joints: their rms, which for one joint is the magnitude itself, (n, m) to (n,)."""
-    return np.abs(values[:, 0]) if values.shape[1] == 1 else np.sqrt(np.square(values).mean(axis=1))
-
-
-def _names(name: str, joints: Sequence[str]) -> list[str]:
-    return [f"{name}.{joint}" for joint in joints] if len(joints) > 1 else [name]
-
-
-def action_table(joints: Sequence[str]) -> SignalTable:
-    """The action: an offset for every joint."""
-    offsets = SignalGroup.of("command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command").signals
-    return SignalTable(tuple(replace(signal, low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD) for signal in offsets))
-
-
-def observation_signals(joints: Sequence[str]) -> tuple[Signal, ...]:
-    """The standard set."""
-    groups: tuple[tuple[str, str, str, Kind], ...] = (
-        ("encoder_angle", "rad", "motor encoder, θ in whole counts", "measured"),
-        ("encoder_rate", "rad/s", "its change over the last control period", "measured"),
-        ("reference_angle", "rad", "q_ref at the end of the coming control period", "reference"),
-        ("reference_rate", "rad/s", "its rate", "reference"),
-        ("reference_acceleration", "rad/s²", "its acceleration", "reference"),
-        ("last_command", "rad", "θ_cmd of the last control period", "command"),
-    )
-    made = [SignalGroup.of(name, unit, meaning, dict.fromkeys(joints), kind) for name, unit, meaning, kind in groups]
-    return SignalTable.of(made).signals
-
-
-class JointTask(Stateful):
-    """Rules of a robot of elastic joints, see `elastic_env.runtime.task.Task`.
+class JointTask(Task):
+    """Rules of a robot of elastic joints on a fixed base.
 
     Args:
         config: Reference, scenario, sensors, rewards, periods.
@@ -227,285 +138,279 @@ class JointTask(Stateful):
         ConfigurationError: An unknown sensor, or the IMU of the link on a robot of several joints.
     """
 
-    STATE = (
-        "_reference", "_noise", "_sensors", "_step", "_present", "_coming", "_state", "_measured", "_shown",
-        "_encoder_bias", "_imu_bias", "_imu", "_offset", "_offset_before", "_command", "_diverged", "_force",
-        "_factor", "_stiffness",
-    )  # fmt: skip
-
-    failure_names: tuple[str, ...] = ()  # what stands on a fixed base cannot fall over
+    config: JointConfig
+    world_type = record_type(("truth", _TRUTH), ("shown", _SHOWN), ("scores", _SCORES))
+    noise_type = record_type(("imu", REAL))
 
     def __init__(self, config: JointConfig, plant: JointPlant, num_worlds: int, observe_imu: bool = False) -> None:
-        self.config, self.name, self.model, self.num_worlds = config, plant.name, plant.model, num_worlds
-        self.num_substeps = substeps(config.control_period_s, config.timestep_s)
-        joints, n = plant.joint_names, len(plant.joint_names)
+        joints = plant.joint_names
         observe_imu = observe_imu or LINK_IMU_SENSOR in config.sensors
-        if observe_imu and n > 1:
+        if observe_imu and len(joints) > 1:
             raise ConfigurationError(
-                f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has {n}; "
+                f"the sensor {LINK_IMU_SENSOR!r} needs a robot of one joint, and {plant.name} has {len(joints)}; "
                 "choose link_encoder to observe the links of several"
             )
-        self._plant, self._joints, self._observes_imu = plant, joints, observe_imu
-        self.metrics: Sequence[Metric] = (
-            *(METRICS_OF_ONE if n == 1 else METRICS_OF_SEVERAL),
-            *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
+        scenario = config.scenario
+        period_s = config.control_period_s
+        count_rad = angle_of_count(plant.true.encoder_counts_per_turn if scenario.encoder_counts else None)
+        reference = PlanTable(plant.motion, period_s, num_worlds)
+        require_stable(stiffest(plant.model, scenario), period_s)
+        super().__init__(
+            config=config,
+            name=plant.name,
+            model=plant.model,
+            assumed=plant.assumed,
+            reference=reference,
+            table=_observed(joints, observe_imu),
+            sensors=FurtherSensors(
+                names=[sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR],
+                joints=dict.fromkeys(joints),
+                scenarios=[scenario] * num_worlds,
+                counts_per_turn=plant.true.encoder_counts_per_turn,
+            ),
+            metrics=(
+                *(METRICS_OF_ONE if len(joints) == 1 else METRICS_OF_SEVERAL),
+                *(() if plant.end_effector is None else METRICS_OF_END_EFFECTOR),
+            ),
+            rules=np.concatenate(
+                [
+                    one(
+                        RULES,
+                        control_period_s=period_s,
+                        is_delayed=is_delayed,
+                        count_rad=count_rad,
+                        highest_rad_s=DIVERGED_RAD_S,
+                    )
+                    for is_delayed in (False, True)
+                ]
+            ),
         )
-        others = [sensor for sensor in config.sensors if sensor != LINK_IMU_SENSOR]
-        self._sensors = FurtherSensors(
-            others, dict.fromkeys(joints), [config.scenario] * num_worlds, plant.true.encoder_counts_per_turn
-        )
-        self.action_table = action_table(joints)
-        observed = [*observation_signals(joints), *([LINK_IMU] if observe_imu else []), *self._sensors.signals]
-        self.observation_table = SignalTable(tuple(observed))
-        self.assumed_model = plant.assumed.observed_by(self.observation_table)
+        self._plant = plant
+        self._joint_names = joints
         self._true_model = plant.true.observed_by(self.observation_table)
-        require_stable(stiffest(plant.model, config.scenario), config.control_period_s)
-        self._at = JointAddresses.of(self.model, joints)
-        servos = [self.model.actuator(servo_name(joint)) for joint in joints]
-        self._inputs = np.array([servo.id for servo in servos])
-        self._integrators = np.array([servo.actadr[0] for servo in servos])
-        self._noise, self._imu = NoiseStream(num_worlds, NOISE), _inertial_imu(config, plant, num_worlds)
         self._rest_watch = RestWatch(plant.static_torque, plant.true.rest_stiffness(config.form), joints)
-        self._reference = PlanTable(plant.motion, config.control_period_s, num_worlds)
-        self._step = np.zeros(num_worlds, dtype=np.int64)
-        self._present = self._coming = self._reference.at(self._step)
-        self._state = JointState(*np.zeros((4, num_worlds, n)))
-        self._measured = self._shown = Measurement(*np.zeros((3, num_worlds, n)))
-        self._encoder_bias, self._imu_bias = np.zeros((2, num_worlds, n))
-        self._offset, self._offset_before, self._command = np.zeros((3, num_worlds, n))
-        self._diverged, self._force = np.zeros(num_worlds, dtype=np.bool_), np.full((num_worlds, 3), np.nan)
-        self._factor = np.ones((num_worlds, n))
-        self._stiffness = np.broadcast_to(self._true_model.stiffness, (num_worlds, n))
-        self._springs = np.array([self.model.tendon(spring_name(joint)).id for joint in self._spread_joints()])
+        self._imu = _inertial_imu(config, plant, num_worlds)
+        self._imu_bias = np.zeros(num_worlds)
+        self._imu_column = self.observation_table.group(LINK_IMU.name).start if observe_imu else -1
+        self._schedule = _schedule(reference, scenario.imu.rate_hz, period_s)
+        self._link_constants = one(
+            _CONSTANTS,
+            weights=one(_SCORES, **{name: getattr(config.reward, name) for name in _SCORES.names or ()}),
+            imu_noise_rad=scenario.imu.noise_rad,
+            imu_bias_rad=scenario.imu.bias_rad,
+            imu_sine_error_rad=scenario.imu.sine_error_rad,
+        )
+        self._springs = [int(self.model.tendon(spring_name(joint)).id) for joint in joints if config.form == "tendon"]
+
+    def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
+        """Begin new episodes, also for the watch over windows at rest."""
+        super().restart(worlds, random)
+        self._rest_watch.restart(worlds)
+
+    def score(self) -> None:
+        """Take further steps into the metrics, and look whether the joints rest in windows at rest."""
+        if not self._rest_watch.is_said and (self._reference.rest >= 0).any():
+            for row in range(self._unscored, self._row + 1):
+                joints = self._joints[row]["truth"]
+                worlds = self._worlds[row]["truth"]
+                coming = self._reference.rest[np.minimum(worlds["step"] + 1, self.num_steps)]
+                is_last = (coming != worlds["rest"]) | (worlds["step"] >= self.num_steps)
+                self._rest_watch.see(
+                    rest=worlds["rest"],
+                    is_last=is_last,
+                    q_ref=joints["q_ref"],
+                    q=joints["q"],
+                    offset=joints["offset"],
+                )
+        super().score()
+
+    def masks(self, sample: Sample) -> dict[str, BoolArray]:
+        """Windows at rest of `hold`; all but standing and onset of the other references."""
+        return {"scored": sample.worlds["truth"]["scored"]}
+
+    def truth(self) -> JointTruth:
+        """State without noise, and the true parameters."""
+        inputs = self._sensor_inputs()
+        state = self._joints[self._row]["truth"]
+        return JointTruth(
+            **vars(inputs),
+            theta=state["theta"].copy(),
+            theta_dot=state["theta_dot"].copy(),
+            q_dot=state["q_dot"].copy(),
+            deflection=state["theta"] - state["q"],
+            stiffness=state["stiffness"].copy(),
+            model=self._true_model,
+        )
+
+    def _has_ranges(self, world: int) -> bool:  # noqa: ARG002  all worlds have one scenario
+        return bool(self.config.scenario.ranges)
+
+    def _draw(self, world: int, random: EpisodeRandom) -> None:
+        scenario = self.config.scenario
+        generator = random.robot
+        n = len(self._joint_names)
+        self._reference.draw(world, generator)
+        homing = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
+        mounting = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
+        self._noise.restart(world, random.noise())
+        if self._imu is not None:
+            mounting += self._imu.draw(world, generator, random.noise())
+        factor = np.ones(n)
+        if scenario.stiffness_spread > 0.0:
+            factor = 1.0 + scenario.stiffness_spread * generator.uniform(-1.0, 1.0, n)
+        robot = RobotDraw(
+            stiffness_factor=tuple(factor.tolist()),
+            encoder_bias_rad=tuple(homing.tolist()),
+            imu_bias_rad=(float(mounting), 0.0),
+            is_delayed=scenario.delay_steps > 0,
+        )
+        if scenario.ranges:
+            robot = draw_robot([ranges.on_fixed_base() for ranges in scenario.ranges], n, generator)
+        self._take_robot(world, robot, self._true_model)
+        self._imu_bias[world] = robot.imu_bias_rad[0]
+        self._kind[world] = int(robot.is_delayed)
+
+    def _place(self, worlds: BoolArray) -> None:
+        """The servos hold q_ref, the springs are already deflected."""
+        simulation, at = self.simulation, self._at
+        truth = self._joints[self._row]["truth"][worlds]
+        self._vary(worlds, truth)
+        q_ref = self._reference.motion[self._reference.plan_of_world[worlds], 0, 0]
+        command = q_ref - truth["homing"]
+        factor = np.array([robot.stiffness_factor for robot in self._drawn(worlds)])
+        q = self._plant.rest_angle(command, factor, truth["backlash"])
+        torque = self._plant.static_torque(q)
+        simulation.qpos[np.ix_(worlds, at["theta"])] = command - self._true_model.servo_compliance * torque
+        simulation.qpos[np.ix_(worlds, at["q"])] = q
+        simulation.ctrl[np.ix_(worlds, at["servo"])] = command
+        for column, servo in enumerate(self._true_model.servos):
+            if servo.integral_gain > 0.0:
+                integrator = self.model.actuator_actadr[at["servo"][column]]
+                simulation.act[worlds, integrator] = torque[:, column] / servo.integral_gain
+        if self._has_sensors:
+            simulation.bind("sensordata")
+            simulation.refresh(worlds)
+
+    def _vary(self, worlds: BoolArray, truth: Records) -> None:
+        """Give the physics the joints that were drawn, (worlds, n)."""
+        scenario, model, simulation = self.config.scenario, self.model, self.simulation
+        if not scenario.ranges and scenario.stiffness_spread == 0.0:
+            return
+        springs = np.ix_(worlds, np.array(self._springs, dtype=np.int64))
+        if self._springs:
+            simulation.vary("tendon_stiffness")[springs] = truth["stiffness"]
+        if not scenario.ranges:
+            return
+        robots = self._drawn(worlds)
+        if self._springs:
+            further_backlash = np.array([[[robot.backlash_rad]] for robot in robots]) * [-0.5, 0.5]
+            simulation.vary("tendon_damping")[springs] = truth["damping"]
+            ends = model.tendon_lengthspring[self._springs] + further_backlash
+            simulation.vary("tendon_lengthspring")[springs] = ends
+        links = np.ix_(worlds, self._at["q_dot"])
+        factor = np.array([[robot.friction_factor] for robot in robots])
+        for field in ("dof_frictionloss", "dof_damping"):
+            simulation.vary(field)[links] = factor * getattr(model, field)[self._at["q_dot"]]
+
+    def _drawn(self, worlds: BoolArray) -> list[RobotDraw]:
+        """The robots of some worlds."""
+        return [self._robot(world) for world in np.flatnonzero(worlds).tolist()]
+
+    def _begin_worlds(self, worlds: BoolArray) -> None:
+        simulation, joints = self.simulation, self._constants
+        if self._imu is not None:
+            self._imu.settle(worlds, simulation.qpos[:, self._at["q"][0]])
+        noise = self._noise.ready()
+        kernels.begin_links(simulation.qpos, simulation.qvel, joints, self._links, noise, worlds, self._steps())
+
+    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
+        simulation, joints = self.simulation, self._constants
+        qpos, qvel = simulation.qpos, simulation.qvel
+        if self._imu is not None:
+            too_fast = (np.abs(qvel) > DIVERGED_RAD_S).any(axis=1)
+            self._imu.advance(~(commanded[2] | too_fast), qpos[:, self._at["q"][0]], qvel[:, self._at["q_dot"][0]])
+        noise = self._noise.ready()
+        return kernels.sense_links(qpos, qvel, joints, self._links, noise, commanded, self._steps(), results)
+
+    def _show_worlds(self, observed: Array) -> None:
+        if self._imu_column >= 0:
+            observed[:, self._imu_column] = self._worlds[self._row]["shown"]["visible_imu"]
 
     @property
-    def num_steps(self) -> int:
-        """Control steps of an episode."""
-        return self._reference.num_steps
+    def _links(self) -> tuple[Any, ...]:
+        """`kernels.Links`."""
+        angle = None if self._imu is None else self._imu.angle
+        return self._schedule, self._link_constants, self._imu_bias, self._imu_column, angle
 
-    def furnish(self, simulation: Simulation) -> None:
-        """See `elastic_env.runtime.task.Task`; all that differs is varied, which the physics keeps."""
-
-    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
-        """Place the robot at rest under zero offset: the servos hold q_ref, the springs are already deflected."""
-        scenario, n = self.config.scenario, len(self._joints)
-        for world in np.flatnonzero(worlds).tolist():
-            generator = draws[world].robot
-            self._reference.draw(world, generator)
-            self._encoder_bias[world] = scenario.encoder_bias_rad * generator.uniform(-1.0, 1.0, n)
-            self._imu_bias[world] = scenario.imu.bias_spread_rad * generator.uniform(-1.0, 1.0)
-            self._noise.restart(world, draws[world].noise())
-            if self._imu is not None:
-                self._imu_bias[world] += self._imu.draw(world, generator, draws[world].noise())
-        if scenario.stiffness_spread > 0.0:
-            self._spread(simulation, worlds, draws)
-        self._rest_watch.restart(worlds)
-        self._step, self._diverged = np.where(worlds, 0, self._step), self._diverged & ~worlds
-        self._follow()
-        self._offset[worlds] = self._offset_before[worlds] = 0.0
-        self._command[worlds] = self._present.q[worlds]
-        if self._sensors:
-            simulation.bind("sensordata")
-        self._place(simulation, worlds)
-        self._read(simulation, worlds)
-        if self._imu is not None:
-            self._imu.settle(worlds, self._state.q[:, 0])
-        fresh = self._measure(worlds)
-        at_rest = Measurement(fresh.encoder, fresh.encoder, fresh.imu)
-        self._measured = self._measured.with_worlds(worlds, at_rest)
-        self._shown = self._shown.with_worlds(worlds, at_rest)
-        if self._sensors:
-            simulation.refresh(worlds)
-            self._feel(simulation)
-            self._sensors.restart(worlds, draws, self.truth())
-
-    def command(self, offset: Array, inputs: Array) -> None:
-        """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
-        self._offset_before, self._offset = self._offset, offset.copy()
-        self._command = self._coming.q + self._offset
-        inputs[:, self._inputs] = self._command - self._encoder_bias
-
-    def disturb(self, simulation: Simulation) -> None:
-        """Nothing pushes the robot."""
-
-    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
-        """Read the new state, then what the sensors show of it; score it."""
-        diverged = diverged | (np.abs(simulation.qvel) > DIVERGED_RAD_S).any(axis=1)
-        self._step, self._diverged = self._step + 1, diverged
-        self._present, self._coming = self._coming, self._reference.at(self._step + 1)
-        self._read(simulation, ~diverged)
-        is_last = (self._coming.rest != self._present.rest) | (self._step >= self.num_steps)
-        self._rest_watch.see(self._present, is_last, self._state.q, self._offset)
-        if self._imu is not None:
-            self._imu.advance(~diverged, self._state.q[:, 0], self._state.q_dot[:, 0])
-        before, self._measured = self._measured, self._measure(~diverged)
-        self._shown = before if self.config.scenario.delay_steps else self._measured
-        if self._sensors:
-            self._feel(simulation)
-            self._sensors.measure(~diverged, self.truth())
-        sample = self.sample()
-        ends = np.array([diverged, diverged, (self._step >= self.num_steps) & ~diverged])
-        reward = functools.reduce(np.add, self.reward_terms(sample).values())
-        return Outcome(self.observe(), sample, reward, ends, bool(ends.any()))
-
-    def observe(self) -> Array:
-        """The columns of `observation_table`."""
-        coming, shown = self._coming, self._shown
-        rate = (shown.encoder - shown.encoder_before) / self.config.control_period_s
-        columns = [shown.encoder, rate, coming.q, coming.q_dot, coming.q_ddot, self._command]
-        if self._observes_imu:
-            columns.append(shown.imu)
-        if self._sensors:
-            columns.append(self._sensors.columns(np.full(self.num_worlds, self.config.scenario.delay_steps > 0)))
-        return np.concatenate(columns, axis=1)
-
-    def sample(self) -> JointSample:
-        """What this step is scored by."""
-        reference = self._present
-        servo_error = self._command - self._encoder_bias - self._state.theta
-        command_rate = (self._offset - self._offset_before) / self.config.control_period_s
-        return JointSample(
-            self._step, reference.q, reference.scored, reference.rest, self._state, self._shown.imu, servo_error,
-            command_rate, self._stiffness, self._diverged,
-        )  # fmt: skip
-
-    def signals(self, sample: JointSample) -> Signals:
-        """Truth and scores of samples, one value per row."""
-        state = sample.state
-        deflection = state.theta - state.q
+    def _signals(self, joints: Records, worlds: Records) -> Signals:
+        q_ref, q = joints["q_ref"], joints["q"]
         of_joints = {
-            "reference_angle": sample.q_ref,
-            "link_angle": state.q,
-            "link_angle_imu": sample.imu,
-            "link_error": sample.q_ref - state.q,
-            "link_error_imu": sample.q_ref - sample.imu,
-            "deflection": deflection,
-            "joint_torque": self._joint_torque(deflection, state.theta_dot - state.q_dot, sample.stiffness),
-            "servo_error": sample.servo_error,
-            "command_rate": sample.command_rate,
+            "reference_angle": q_ref,
+            "link_angle": q,
+            "link_error": q_ref - q,
+            "deflection": joints["theta"] - q,
+            "joint_torque": spring_torque(joints),
+            "servo_error": joints["command"] - joints["homing"] - joints["theta"],
+            "command_rate": joints["command_rate"],
         }
-        if len(self._joints) == 1:
+        if len(self._joint_names) == 1:
+            imu = worlds["shown"]["visible_imu"]
             shown = {name: values[:, 0].copy() for name, values in of_joints.items()}
+            shown |= {"link_angle_imu": imu.copy(), "link_error_imu": q_ref[:, 0] - imu}
         else:
-            shown = self._of_several(of_joints)
+            shown = self._signals_of_several(of_joints)
         if self._plant.end_effector is not None:
-            distance, tilt = self._plant.end_effector.errors(sample.q_ref, state.q)
+            distance, tilt = self._plant.end_effector.errors(q_ref, q)
             shown |= {"end_effector_error": distance, "end_effector_tilt": tilt}
-        return {"time_s": sample.step * self.config.control_period_s, **shown, "rest": sample.rest.copy()}
+        truth = worlds["truth"]
+        return {"time_s": truth["step"] * self.config.control_period_s, **shown, "rest": truth["rest"].copy()}
 
-    def _of_several(self, of_joints: dict[str, Array]) -> Signals:
+    def _signals_of_several(self, of_joints: dict[str, Array]) -> Signals:
         """Signals of every joint, and what they come to together."""
         each = {
-            one: values[:, column].copy()
+            f"{name}.{joint}": values[:, column].copy()
             for name, values in of_joints.items()
-            if "imu" not in name
-            for column, one in enumerate(_names(name, self._joints))
+            for column, joint in enumerate(self._joint_names)
         }
         error = of_joints["link_error"]
-        summed = "link_error", "deflection", "servo_error", "command_rate"
-        together = {name: over_joints(of_joints[name]) for name in summed}
+        summed = ("link_error", "deflection", "servo_error", "command_rate")
         return {
             **each,
-            **together,
+            **{name: np.sqrt(np.square(of_joints[name]).mean(axis=1)) for name in summed},
             "link_error_lowest": error.min(axis=1),
             "link_error_highest": error.max(axis=1),
             "link_error_largest": np.abs(error).max(axis=1),
             "joint_torque": np.abs(of_joints["joint_torque"]).max(axis=1),
         }
 
-    def masks(self, sample: JointSample) -> dict[str, BoolArray]:
-        """Windows at rest of `hold`; all but standing and onset of the other references."""
-        return {"scored": sample.scored}
 
-    def reward_terms(self, sample: JointSample) -> dict[str, Array]:
-        """Weighted penalties for link error, restless commands and divergence."""
-        weights = self.config.reward
-        return {
-            "link_error": weights.link_error * tracking_penalty(sample.q_ref - sample.state.q),
-            "command_rate": weights.command_rate * smoothness_penalty(sample.command_rate),
-            "divergence": weights.divergence * divergence_penalty(sample.diverged),
-        }
+def _observed(joints: Sequence[str], observe_imu: bool) -> list[Signal]:
+    """The standard columns."""
+    groups = joint_groups(dict.fromkeys(joints))
+    return [signal for group in groups for signal in group.signals] + ([LINK_IMU] if observe_imu else [])
 
-    def truth(self) -> JointTruth:
-        """State without noise, and the true parameters."""
-        state = self._state
-        deflection = state.theta - state.q
-        torque = self._joint_torque(deflection, state.theta_dot - state.q_dot, self._stiffness)
-        values = (state.q, torque, self._force, state.theta, state.theta_dot, state.q_dot, deflection, self._stiffness)
-        return JointTruth(*(value.copy() for value in values), model=self._true_model)
 
-    def _joint_torque(self, deflection: Array, deflection_rate: Array, stiffness: Array) -> Array:
-        model = self._true_model
-        return joint_torque(deflection, deflection_rate, stiffness, model.damping, model.backlash)
-
-    def _spread_joints(self) -> Sequence[str]:
-        """Joints whose springs differ from world to world."""
-        return self._joints if self.config.scenario.stiffness_spread > 0.0 and self.config.form == "tendon" else ()
-
-    def _spread(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
-        """Draw a factor on K for every joint of new robots, and give it to the springs."""
-        width, factor = self.config.scenario.stiffness_spread, self._factor.copy()
-        for world in np.flatnonzero(worlds).tolist():
-            factor[world] = 1.0 + width * draws[world].robot.uniform(-1.0, 1.0, len(self._joints))
-        # samples keep the array that they were taken with
-        self._factor, self._stiffness = factor, factor * self._true_model.stiffness
-        if len(self._springs):
-            each = np.ix_(worlds, self._springs)
-            simulation.vary("tendon_stiffness")[each] = factor[worlds] * self.model.tendon_stiffness[self._springs]
-
-    def _place(self, simulation: Simulation, worlds: BoolArray) -> None:
-        command = (self._command - self._encoder_bias)[worlds]
-        q = self._plant.rest_angle(command, self._factor[worlds])
-        torque = self._plant.static_torque(q)
-        theta = command - self._true_model.servo_compliance * torque
-        simulation.qpos[np.ix_(worlds, self._at.theta)] = theta
-        simulation.qpos[np.ix_(worlds, self._at.q)] = q
-        simulation.ctrl[np.ix_(worlds, self._inputs)] = command
-        for column, servo in enumerate(self._true_model.servos):
-            if servo.integral_gain > 0.0:
-                simulation.act[worlds, self._integrators[column]] = torque[:, column] / servo.integral_gain
-
-    def _read(self, simulation: Simulation, worlds: BoolArray) -> None:
-        """The true state of some worlds; the others keep their last one."""
-        at, qpos, qvel = self._at, simulation.qpos, simulation.qvel
-        now = JointState(qpos[:, at.theta], qvel[:, at.theta_dot], qpos[:, at.q], qvel[:, at.q_dot])
-        self._state = now if worlds.all() else self._state.with_worlds(worlds, now)
-
-    def _follow(self) -> None:
-        """Look the reference up at the present step and at the next one."""
-        self._present, self._coming = self._reference.at(self._step), self._reference.at(self._step + 1)
-
-    def _feel(self, simulation: Simulation) -> None:
-        """Take the specific force, which lags one physics step behind, where the model has the sensor for it."""
-        if ACCELEROMETER in self.config.sensors:
-            self._force = specific_force(self.model, simulation.bind("sensordata"))
-
-    def _measure(self, worlds: BoolArray) -> Measurement:
-        """What the sensors say now; the other worlds keep their last values."""
-        scenario, last = self.config.scenario, self._measured
-        counts = self._true_model.encoder_counts_per_turn if scenario.encoder_counts else None
-        due = worlds & is_due(self._step, scenario.imu.rate_hz, self.config.control_period_s)
-        fresh = Measurement(
-            encoder=quantise(self._state.theta + self._encoder_bias, angle_of_count(counts)),
-            encoder_before=last.encoder,
-            imu=np.where(due[:, None], self._link_angle(due), last.imu),
-        )
-        return fresh if worlds.all() else last.with_worlds(worlds, fresh)
-
-    def _link_angle(self, due: BoolArray) -> Array:
-        """What the IMUs of worlds whose next sample is due show of the links, (num_worlds, n) [rad]."""
-        noise, imu = self._noise.next(due)["imu"][:, None], self.config.scenario.imu
-        if self._imu is None:
-            return attitude(imu, self._state.q, self._imu_bias, noise)
-        return attitude(imu, self._imu.angle[:, None], self._imu_bias, np.zeros_like(noise))
+def _schedule(reference: PlanTable, imu_rate_hz: float, period_s: float) -> Records:
+    """Records of `_SCHEDULE`, one per step."""
+    rows = np.zeros(reference.num_steps + 1, _SCHEDULE)
+    rows["scored"] = reference.scored
+    rows["rest"] = reference.rest
+    rows["imu_is_due"] = is_due(np.arange(len(rows)), imu_rate_hz, period_s)
+    rows.flags.writeable = False
+    return rows
 
 
 def stiffest(model: mujoco.MjModel, scenario: Scenario) -> mujoco.MjModel:
-    """A model with the stiffest springs that a scenario draws; all tendons with stiffness count as springs."""
-    if scenario.stiffness_spread == 0.0:
+    """A model with the stiffest springs and strongest dampers that a scenario draws; tendons count as springs."""
+    stiffness = [1.0 + scenario.stiffness_spread] + [
+        own.stiffness[1] * own.joint_stiffness[1] for own in scenario.ranges
+    ]
+    damping = [1.0] + [own.damping[1] for own in scenario.ranges]
+    if max(stiffness) == max(damping) == 1.0:
         return model
     stiff = copy.copy(model)
-    stiff.tendon_stiffness[:] *= 1.0 + scenario.stiffness_spread
+    stiff.tendon_stiffness[:] *= max(stiffness)
+    stiff.tendon_damping[:] *= max(damping)
     return stiff
 
 

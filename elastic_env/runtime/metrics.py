@@ -8,7 +8,6 @@ import numpy as np
 
 from elastic_env.core.compiled import compile_now, compiled
 from elastic_env.core.signals import Array, BoolArray, Signals
-from elastic_env.core.state import Stateful
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,8 @@ _FOLDS = {
 }
 
 
-class RunningStatistic(Stateful):
+class RunningStatistic:
     """One statistic of the rows of an array, over the steps at which they were sampled, in every world."""
-
-    STATE = ("_total", "_count")
 
     def __init__(self, name: str, num_rows: int, num_worlds: int) -> None:
         self._name = name
@@ -89,13 +86,11 @@ def _add_in_order(values: Array, total: Array) -> None:
                 total[row, world] += values[row, step, world]
 
 
-class EpisodeMetrics(Stateful):
+class EpisodeMetrics:
     """The metrics of a task, accumulated step by step in every world.
 
     What it compiles it compiles now: a motion of hardware cannot wait for the compiler.
     """
-
-    STATE = ("_statistics",)
 
     def __init__(self, metrics: Sequence[Metric], num_worlds: int) -> None:
         self._names = [metric.name for metric in metrics]

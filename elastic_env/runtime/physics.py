@@ -46,7 +46,7 @@ class Simulation(Protocol):
     def take(self, world: int, model: mujoco.MjModel) -> None:
         """Give a world a model of its own, with as many bodies, joints and sensors, instead of varied fields.
 
-        The state of the world stays. `get_state` does not hold the models: give them again after `set_state`.
+        The state of the world stays.
         """
         ...
 
@@ -119,21 +119,6 @@ class SingleWorld:
         self._counts, self._views = self._data.warning.number[None], dict[tuple[str, ...], tuple[Array, ...]]()
         self.qpos, self.qvel = self._data.qpos[None], self._data.qvel[None]
         self.act, self.ctrl = self._data.act[None], self._data.ctrl[None]
-
-    def get_state(self) -> dict[str, Any]:
-        """See `ManyWorlds`; of one world."""
-        kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-        state = np.zeros(mujoco.mj_stateSize(self.model, kind))
-        mujoco.mj_getState(self.model, self._data, state, kind)
-        varied = {field: getattr(self.model, field).copy() for field in sorted(self._varied)}
-        return {"state": state, "warning": self._counts.copy(), "varied": varied}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """See `ManyWorlds`."""
-        for field, values in state["varied"].items():
-            self.vary(field)[0] = values
-        mujoco.mj_setState(self.model, self._data, state["state"], int(mujoco.mjtState.mjSTATE_INTEGRATION))
-        self._counts[:] = state["warning"]
 
     def bind(self, field: str) -> Array:
         """See `Simulation`."""
@@ -209,12 +194,22 @@ class ManyWorlds:
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the live views and the threads, for `copy.deepcopy`, pickle, and a process that was forked."""
-        made = (self.model, self.num_worlds, self._batch.nthread, self._warnings, self._own_models)
-        return {"made": made, "worlds": self.get_state()}
+        return {
+            "made": (self.model, self.num_worlds, self._batch.nthread, self._warnings, self._own_models),
+            "bound": self._bound,
+            "varied": {field: self.vary(field).copy() for field in self._varied},
+            "state": self._batch.state.copy(),
+            "warning": self._batch.warning.copy(),
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._start(*state["made"])
-        self.set_state(state["worlds"])
+        for field, values in state["varied"].items():
+            self.vary(field)[:] = values
+        for field in state["bound"]:
+            self.bind(field)
+        self._batch.state[:] = state["state"]
+        self._batch.warning[:] = state["warning"]
 
     def _ready(self) -> batch.Batch:
         """The batch with the models of its worlds, and threads of this process: a fork leaves those of the parent."""
@@ -227,22 +222,6 @@ class ManyWorlds:
             self._batch.set_models(self._own_models)
             self._are_given = True
         return self._batch
-
-    def get_state(self) -> dict[str, Any]:
-        """Everything that goes on from here: integration states, outputs, warnings, varied fields of the model."""
-        outputs = {field: self.bind(field).copy() for field in sorted(self._bound)}
-        varied = {field: self.vary(field).copy() for field in sorted(self._varied)}
-        state, warning = self._batch.state.copy(), self._batch.warning.copy()
-        return {"state": state, "warning": warning, "outputs": outputs, "varied": varied}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that `get_state` returned; outputs are filled again by the next step."""
-        for field, values in state["varied"].items():
-            self.vary(field)[:] = values
-        for field in state["outputs"]:
-            self.bind(field)
-        self._batch.state[:] = state["state"]
-        self._batch.warning[:] = state["warning"]
 
     def bind(self, field: str) -> Array:
         """See `Simulation`."""

@@ -52,13 +52,13 @@ class Scenario(Model):
     sensor_noise: float = quantity("1", 0.0, ge=0, description="factor on the errors of further sensors")
     delay_steps: int = quantity("control steps", 0, ge=0, le=1, description="age of the measurements")
     ranges: tuple[RobotRanges, ...] = Field(default=(), max_length=MOST_RANGES)
-    """walker: ranges that every episode's robot is drawn from, in equal shares where there are several; none for the
-    robot that the other fields describe. What is drawn comes on top of what they say."""
+    """Ranges that every episode's robot is drawn from, in equal shares where there are several; none for the robot that
+    the other fields describe. What is drawn comes on top of what they say."""
 
     @model_validator(mode="after")
     def _ranges_say_all_that_is_drawn(self) -> Self:
         fixed = [name for name in _LEFT_TO_RANGES if getattr(self, name)]
-        if self.ranges and (fixed or self.pelvis_imu.bias_spread_rad > 0.0):
+        if self.ranges and (fixed or self.imu.bias_spread_rad > 0.0 or self.pelvis_imu.bias_spread_rad > 0.0):
             raise ValueError(
                 "ranges say what is drawn; leave out "
                 f"{', '.join(fixed or ['bias_spread_rad of pelvis_imu'])}, or give the ranges an interval for it"
@@ -197,7 +197,7 @@ DISTRIBUTIONS: dict[str, ScenarioChange] = {
 quantity beyond these."""
 
 
-WALKER_FIELDS = ("push_n", "slope_rad", "ranges")
+WALKER_FIELDS = ("push_n", "slope_rad")
 """Parameters that only a robot that walks knows."""
 WALKER_ONLY = tuple(name for name, change in CHANGES.items() if change(GROUNDS["nominal"]).keys() & {*WALKER_FIELDS})
 """Changes that set one of them."""
@@ -229,7 +229,7 @@ def make_scenario(name: "str | Scenario", walks: bool = True) -> Scenario:
             raise ConfigurationError(f"scenario {name!r}: {change!r} is a ground and can only stand first")
         known = CHANGES | DISTRIBUTIONS
         if change not in known:
-            raise unknown_name("scenario", change, [*scenario_names(walks), *(DISTRIBUTIONS if walks else ())])
+            raise unknown_name("scenario", change, [*scenario_names(walks), *DISTRIBUTIONS])
         added = known[change](ground)
         twice = sorted(parameters.keys() & added.keys())
         if twice:

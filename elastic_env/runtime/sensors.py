@@ -13,8 +13,7 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.core.state import Stateful
-from elastic_env.dynamics.walk_kernels import complementary_filter, in_whole_counts, settled_vertical, shown_angle
+from elastic_env.dynamics.control_kernels import complementary_filter, in_whole_counts, settled_vertical, shown_angle
 
 
 class AttitudeSensor(Model):
@@ -152,7 +151,7 @@ def is_due(step: IntArray, rate_hz: float, control_period_s: float) -> BoolArray
     return (step == 0) | (np.floor(step * samples_per_step + 1e-9) > np.floor((step - 1) * samples_per_step + 1e-9))
 
 
-class NoiseStream(Stateful):
+class NoiseStream:
     """Standard normal samples, one independent stream per world, drawn in blocks.
 
     World i's samples depend on its generator and on how many it has used, never on the other worlds.
@@ -162,8 +161,6 @@ class NoiseStream(Stateful):
         kind: Structured type of a sample, of real numbers alone.
         block: Samples that are drawn at once.
     """
-
-    STATE = ("_samples", "_used", "_most_used", "_generators")
 
     def __init__(self, num_worlds: int, kind: np.dtype[Any], block: int = 250) -> None:
         # samples of a time are neighbours in memory: worlds mostly use theirs together
@@ -210,7 +207,7 @@ _PENDULUM_NOISE = np.dtype([("rate", np.float64), ("force", np.float64, (2,))])
 """A sample of noise: of the gyroscope, and of the accelerometer along both axes in the plane of the motion [1]."""
 
 
-class PendulumImu(Stateful):
+class PendulumImu:
     r"""An `InertialSensor` on a link that hangs from a horizontal axis where q = 0, and turns with it.
 
     In the frame of the link, x along its motion and z towards the axis, the vertical is (sin q, 0, cos q). The specific
@@ -227,8 +224,6 @@ class PendulumImu(Stateful):
         period_s: Control period [s].
         num_worlds: How many.
     """
-
-    STATE = ("_up", "_last", "_bias", "_noise")
 
     def __init__(
         self, sensor: InertialSensor, arm_m: float, gravity_m_s2: float, period_s: float, num_worlds: int

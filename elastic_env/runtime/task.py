@@ -1,102 +1,464 @@
-"""What a task is: the rules of one environment on (num_worlds, ...) arrays."""
+"""The rules of a robot of elastic joints, in many worlds: one control step, from the command to the observation.
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+    command → (physics) → truth → measured → score → observation
 
+Kernels do the arithmetic, see `elastic_env.dynamics.control_kernels`. The last control steps stand in blocks of
+records, from which signals and metrics are made when they are needed.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import gymnasium
 import mujoco
+import numpy as np
+import numpy.typing as npt
 
-from elastic_env.core.draws import Draws
-from elastic_env.core.signals import Array, BoolArray, Signals, SignalTable
-from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.physics import Simulation
+from elastic_env.core.compiled import compile_now
+from elastic_env.core.episode_random import EpisodeRandom
+from elastic_env.core.errors import ActionError
+from elastic_env.core.robot_ranges import RobotDraw
+from elastic_env.core.signals import Array, BoolArray, Kind, Mirrored, Signal, SignalGroup, Signals, SignalTable
+from elastic_env.dynamics import control_kernels as kernels
+from elastic_env.joint.elasticity import joint_torque
+from elastic_env.motion.trajectory import PlanTable
+from elastic_env.runtime.further_sensors import ACCELEROMETER, FurtherSensors, SensorInputs, specific_force
+from elastic_env.runtime.metrics import EpisodeMetrics, Metric
+from elastic_env.runtime.physics import Simulation, simulate, substeps
 from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.runtime.rows import JOINT, JOINT_COLUMNS, Records, Sample, addresses, columns_of
+from elastic_env.runtime.sensors import NoiseStream
+from elastic_env.runtime.step_info import StepInfo
 
-DIVERGED_ROW, TERMINATED_ROW, TRUNCATED_ROW = 0, -2, -1
-"""Rows of `Outcome.ends`; behind the first stands one for each of `Task.failure_names`."""
+ACTION_BOUND_RAD = 0.3
+"""Largest command offset [rad]."""
+DIVERGED = "diverged"
+"""Reason of termination where the simulation produced a bad number; MuJoCo alone would restart it silently."""
+
+_SCORED_ROWS, _FEWEST_STEPS, _MOST_STEPS = 4096, 16, 256
+"""Rows (steps of all worlds) whose signals are computed together, and how many steps that can be."""
 
 
-class Outcome(NamedTuple):
-    """What a control step came to, one column or row per world.
+def action_table(joints: Sequence[str]) -> SignalTable:
+    """The action: an offset for every joint."""
+    offsets = SignalGroup.of("command_offset", "rad", "θ_cmd − q_ref", dict.fromkeys(joints), "command").signals
+    return SignalTable(tuple(replace(own, low=-ACTION_BOUND_RAD, high=ACTION_BOUND_RAD) for own in offsets))
 
-    Attributes:
-        observation: (num_worlds, len(observation_table)).
-        sample: What signals and masks need of this step, `elastic_env.core.rows.Rows` that nothing changes later.
-        reward: (num_worlds,).
-        ends: Whether the world diverged, failed, is terminated and is truncated, see `DIVERGED_ROW`.
-        is_over: Whether any world is.
+
+def joint_groups(joints: Mapping[str, Mirrored | None]) -> list[SignalGroup]:
+    """What every robot observes of its joints, `elastic_env.runtime.rows.JOINT_COLUMNS`.
+
+    Args:
+        joints: In order, and what an angle of theirs is in the mirror.
     """
+    described: tuple[tuple[str, str, Kind], ...] = (
+        ("rad", "motor encoder, θ in whole counts", "measured"),
+        ("rad/s", "its change over the last control period", "measured"),
+        ("rad", "q_ref at the end of the coming control period", "reference"),
+        ("rad/s", "its rate", "reference"),
+        ("rad/s²", "its acceleration", "reference"),
+        ("rad", "θ_cmd of the last control period", "command"),
+    )
+    return [
+        SignalGroup.of(name, unit, meaning, joints, kind)
+        for name, (unit, meaning, kind) in zip(JOINT_COLUMNS, described, strict=True)
+    ]
+
+
+class Transition(NamedTuple):
+    """Result of a control step, one row per world."""
 
     observation: Array
-    sample: Any
     reward: Array
-    ends: BoolArray
-    is_over: bool
-
-
-class Task(Protocol):
-    """Rules of an environment, driven by `elastic_env.runtime.worlds.Worlds` in this order every control step.
-
-    command → disturb → (physics) → sense
-
-    What a step is scored by is kept in a sample, of which signals and masks are made when they are needed: together for
-    many steps, whose samples are joined.
-    """
-
-    name: str
-    model: mujoco.MjModel
-    num_worlds: int
-    num_substeps: int
-    observation_table: SignalTable
-    action_table: SignalTable
-    metrics: Sequence[Metric]
-    failure_names: tuple[str, ...]
-    assumed_model: RobotModel
+    terminated: BoolArray
+    truncated: BoolArray
+    info: dict[str, Any]
 
     @property
-    def num_steps(self) -> int:
-        """Control steps of an episode that does not fail."""
-        ...
+    def done(self) -> BoolArray:
+        """Worlds whose episode is over."""
+        return self.terminated | self.truncated
 
-    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
-        """Begin new episodes in some worlds, a (num_worlds,) mask; one of `draws` for every world of the batch."""
-        ...
 
-    def furnish(self, simulation: Simulation) -> None:
-        """After `set_state`: give the worlds what of their robots the state of the physics does not hold."""
-        ...
+class Task(ABC):
+    """Rules of an environment.
 
-    def command(self, offset: Array, inputs: Array) -> None:
-        """Command offsets, (num_worlds, n) [rad], already within bounds, as inputs of the servos, (num_worlds, nu)."""
-        ...
+    Args:
+        config: With `control_period_s`, `timestep_s` and `sensors`.
+        name: Of the robot.
+        model: Its plant, what is drawn aside.
+        assumed: What a compensator may know of it.
+        reference: What the links are to do in every world.
+        table: What is observed, further sensors aside.
+        sensors: Further sensors, whose columns stand behind the others.
+        metrics: Figures of an episode.
+        rules: Records of `elastic_env.runtime.rows.RULES`, one for every kind of world.
 
-    def disturb(self, simulation: Simulation) -> None:
-        """Apply what acts on the robot from outside during the coming control period."""
-        ...
+    Attributes:
+        failure_names: Reasons, beside `DIVERGED`, why an episode can be terminated.
+        world_type: Structured type of what a control step keeps of a world: truth, shown, scores.
+        noise_type: Structured type of a sample of noise.
+        num_steps: Control steps of an episode that does not fail.
+    """
 
-    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
-        """Take truth and measurements of the new state, which worlds that diverged do not have; score it."""
-        ...
+    failure_names: tuple[str, ...] = ()
+    world_type: np.dtype[Any]
+    noise_type: np.dtype[Any]
+
+    def __init__(
+        self,
+        *,
+        config: Any,
+        name: str,
+        model: mujoco.MjModel,
+        assumed: RobotModel,
+        reference: PlanTable,
+        table: Sequence[Signal],
+        sensors: FurtherSensors,
+        metrics: Sequence[Metric],
+        rules: Records,
+    ) -> None:
+        joints = assumed.joint_names
+        num_worlds = len(reference.plan_of_world)
+        self.config = config
+        self.name = name
+        self.model = model
+        self.num_worlds = num_worlds
+        self.num_steps = reference.num_steps
+        self.num_substeps = substeps(config.control_period_s, config.timestep_s)
+        self.observation_table = SignalTable((*table, *sensors.signals))
+        self.action_table = action_table(joints)
+        self.assumed_model = assumed.observed_by(self.observation_table)
+        self.metrics = metrics
+        self._reference = reference
+        self._sensors = sensors
+        self._has_sensors = bool(sensors.signals)
+        self._has_further_terms = type(self).further_reward_terms is not Task.further_reward_terms
+        self._width = len(self.observation_table)
+        self._at = addresses(model, joints)
+        self._columns = columns_of(self.observation_table, JOINT_COLUMNS)
+        self._rules = rules
+        self._kind = np.zeros(num_worlds, dtype=np.int64)
+        self._robots: list[RobotDraw | None] = [None] * num_worlds
+        self._noise = NoiseStream(num_worlds, self.noise_type)
+        self._bound = self.action_table.space(np.float32).high.astype(np.float64)
+        self._failures = (DIVERGED, *self.failure_names)
+        self._no_reason = np.full(num_worlds, "", dtype="<U1")
+        self._no_reason.flags.writeable = False
+        self._begun = np.zeros(num_worlds, dtype=np.bool_)
+        self._is_begun = False
+        self._steps_at_once = min(max(_SCORED_ROWS // num_worlds, _FEWEST_STEPS), _MOST_STEPS)
+        self._begin_block(np.zeros((2, num_worlds, len(joints)), JOINT), np.zeros((2, num_worlds), self.world_type))
+
+    def attach(self, simulation: Simulation | None = None, num_threads: int = 0, is_scalar: bool = False) -> None:
+        """Take what moves the robots, and compile all that a control step needs: hardware cannot wait for that later.
+
+        Args:
+            simulation: What moves instead of MuJoCo, such as hardware.
+            num_threads: Threads of MuJoCo's physics, 0 for all cores; results do not depend on it.
+            is_scalar: Whether errors speak of one world, whose action has no axis of worlds.
+        """
+        self.simulation = simulation or simulate(self.model, self.num_worlds, num_threads)
+        self._is_scalar = is_scalar
+        self._metrics = EpisodeMetrics(self.metrics, self.num_worlds)
+        if simulation is not None:  # scoring many takes 2 ms, half a control period of hardware
+            self._steps_at_once = _FEWEST_STEPS
+        compile_now(self._rehearse)
+
+    def restart(self, worlds: BoolArray, random: Sequence[EpisodeRandom]) -> None:
+        """Begin new episodes in some worlds, a (num_worlds,) mask: at rest under zero offset, the springs deflected.
+
+        Args:
+            worlds: Which.
+            random: Generators of every world.
+        """
+        simulation = self.simulation
+        self.score()
+        self._take_rows(2)
+        simulation.restart(worlds)
+        self._metrics.restart(worlds)
+        last, now = self._row - 1, self._row
+        for block in (self._joints, self._worlds):  # what samples keep stays as it is
+            block[last] = block[last - 2]
+            block[now] = block[now - 2]
+        self._unscored = self._row + 1
+        for world in np.flatnonzero(worlds).tolist():
+            self._draw(world, random[world])
+        self._place(worlds)
+        self._begin_worlds(worlds)
+        for block in (self._joints, self._worlds):
+            block[last][worlds] = block[now][worlds]
+        if self._has_sensors:
+            self._sensors.restart(worlds, random, self._sensor_inputs())
+        self._begun = self._begun | worlds
+        self._is_begun = bool(self._begun.all())
+
+    def step(self, action: npt.ArrayLike) -> Transition:
+        """One control period under the actions, (num_worlds, n) [rad].
+
+        Raises:
+            ActionError: Wrong shape, or a value that is not finite.
+            ResetNeeded: A world has not begun an episode yet.
+        """
+        if not self._is_begun:
+            some = f", of the worlds {np.flatnonzero(~self._begun).tolist()} too" if self._begun.any() else ""
+            raise gymnasium.error.ResetNeeded(f"reset() comes before the first step(){some}")
+        offset, is_clipped = self._command(action)
+        self._disturb()
+        self.simulation.advance(self.num_substeps)
+        self._take_rows(1)
+        observation, reward, ends, is_over = self._sense(offset, is_clipped)
+        sample = self.sample()
+        info = StepInfo({"termination": self._no_reason}, partial(self._describe, sample))
+        if is_over:
+            info["termination"] = self._reasons(ends)
+            self.score()
+            info["episode_metrics"] = {**self._metrics.values(), **dict(zip(self._failures, ends, strict=False))}
+        return Transition(observation, reward, ends[-2], ends[-1], info)
 
     def observe(self) -> Array:
         """A fresh observation of the present state, (num_worlds, len(observation_table))."""
-        ...
+        observed = np.empty((self.num_worlds, self._width))
+        kernels.show_joints(self._constants, self._steps(), observed)
+        self._show_worlds(observed)
+        self._show_sensors(observed)
+        return observed
 
-    def sample(self) -> Any:
-        """As `Outcome.sample`, of the present state."""
-        ...
+    def sample(self) -> Sample:
+        """The present control step."""
+        return Sample(self._joints[self._row], self._worlds[self._row])
 
-    def signals(self, sample: Any) -> Signals:
-        """Truth and scores of samples by name, one value per row."""
-        ...
+    def signals(self, sample: Sample | None = None) -> Signals:
+        """Truth and scores of samples by name, one value per row; by default of the present step."""
+        sample = self.sample() if sample is None else sample
+        return self._signals(sample.joints["truth"], sample.worlds)
 
-    def reward_terms(self, sample: Any) -> dict[str, Array]:
+    def score(self) -> None:
+        """Take into the metrics the steps that are not yet; when that happens makes no difference to them."""
+        rows = slice(self._unscored, self._row + 1)
+        shape = (rows.stop - rows.start, self.num_worlds)
+        self._unscored = rows.stop
+        if shape[0] <= 0:
+            return
+        sample = Sample(self._joints[rows].reshape(-1, len(self._at)), self._worlds[rows].reshape(-1))
+        truth = sample.worlds["truth"]
+        masks = self.masks(sample)
+        if truth["diverged"].any():
+            masks = {name: mask & ~truth["diverged"] for name, mask in masks.items()}
+        masks["all"] = np.ones(shape, dtype=np.bool_)
+        signals = {**self.signals(sample), "clipped": truth["clipped"].astype(np.float64)}
+        self._metrics.update(
+            {name: signal.reshape(shape) for name, signal in signals.items()},
+            {name: mask.reshape(shape) for name, mask in masks.items()},
+        )
+
+    def reward_terms(self, sample: Sample) -> dict[str, Array]:
         """Weighted terms whose sum is the reward, one value per row."""
-        ...
+        scores = sample.worlds["scores"]
+        return {name: scores[name].copy() for name in scores.dtype.names or ()} | self.further_reward_terms(sample)
 
-    def masks(self, sample: Any) -> dict[str, BoolArray]:
-        """Samples that count in the metrics, "scored", and the parts of them that the metrics name, by row."""
-        ...
+    def further_reward_terms(self, sample: Sample) -> dict[str, Array]:  # noqa: ARG002  there are none
+        """Terms that a task of one's own adds to the reward, one value per row."""
+        return {}
 
+    @abstractmethod
+    def masks(self, sample: Sample) -> dict[str, BoolArray]:
+        """Rows that count in the metrics, "scored", and the parts of them that the metrics name."""
+
+    def robot_record(self, world: int) -> dict[str, float]:
+        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
+        return self._robot(world).record() if self._has_ranges(world) else {}
+
+    @abstractmethod
     def truth(self) -> Any:
         """Noise-free state and true parameters, for rewards, metrics and the oracle."""
-        ...
+
+    # what differs from robot to robot
+
+    @abstractmethod
+    def _has_ranges(self, world: int) -> bool:
+        """Whether a world draws its robots from ranges."""
+
+    @abstractmethod
+    def _draw(self, world: int, random: EpisodeRandom) -> None:
+        """Draw robot, sensors and noise of a new episode, see `_take_robot`."""
+
+    @abstractmethod
+    def _place(self, worlds: BoolArray) -> None:
+        """Set the physics of some worlds to rest under zero offset."""
+
+    @abstractmethod
+    def _begin_worlds(self, worlds: BoolArray) -> None:
+        """Truth and measurements at the start of an episode in some worlds."""
+
+    @abstractmethod
+    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
+        """Truth, measurements, ends, scores and observation of a control step; whether an episode ends.
+
+        Args:
+            commanded: `kernels.Commanded`.
+            results: To be filled, `kernels.Results`.
+        """
+
+    @abstractmethod
+    def _show_worlds(self, observed: Array) -> None:
+        """Fill the columns of the present state that are not of the joints."""
+
+    @abstractmethod
+    def _signals(self, joints: Records, worlds: Records) -> Signals:
+        """As `signals`, from the truth of the joints, (rows, n), and records of worlds, (rows,)."""
+
+    def _robot(self, world: int) -> RobotDraw:
+        """The robot of a world, from its first episode on."""
+        robot = self._robots[world]
+        assert robot is not None
+        return robot
+
+    def _take_robot(self, world: int, robot: RobotDraw, true_model: RobotModel) -> None:
+        """Keep the robot of a world, and write what is true of its joints.
+
+        Args:
+            world: Number of the world.
+            robot: As it was drawn.
+            true_model: The true robot, what is drawn aside.
+        """
+        self._robots[world] = robot
+        truth = self._joints[self._row, world]["truth"]
+        truth["homing"] = robot.encoder_bias_rad
+        truth["stiffness"] = true_model.stiffness * np.array(robot.stiffness_factor)
+        truth["damping"] = true_model.damping * robot.damping_factor
+        truth["backlash"] = true_model.backlash + robot.backlash_rad
+
+    def _disturb(self) -> None:  # noqa: B027  most robots are not pushed
+        """Apply what acts on the robot from outside during the coming control period."""
+
+    _periods = 1.0
+    """Control periods that the last step took."""
+
+    @property
+    def _constants(self) -> tuple[Any, ...]:
+        """`kernels.Joints`."""
+        plans = self._reference
+        return self._at, self._columns, plans.motion, plans.plan_of_world, self._rules, self._kind
+
+    def _steps(self) -> tuple[Any, ...]:
+        """`kernels.Steps`."""
+        row = self._row
+        return self._joints[row - 1], self._joints[row], self._worlds[row - 1], self._worlds[row]
+
+    def _command(self, action: npt.ArrayLike) -> tuple[Array, BoolArray]:
+        """Command offsets within their bounds; where an action was beyond them, (num_worlds,)."""
+        given = np.asarray(action)
+        if given.dtype.kind not in "fiub" or given.shape != (self.num_worlds, len(self._bound)):
+            raise self._refused(given)
+        offset = given.astype(np.float64, order="C")
+        is_clipped = np.empty(self.num_worlds, dtype=np.bool_)
+        joints, worlds = self._joints[self._row], self._worlds[self._row]
+        inputs = self.simulation.ctrl
+        if not kernels.command(self._constants, joints, worlds, offset, self._bound, is_clipped, inputs):
+            raise self._refused(given.astype(np.float64))
+        return offset, is_clipped
+
+    def _sense(self, offset: Array, is_clipped: BoolArray) -> tuple[Array, Array, BoolArray, bool]:
+        """Observation, reward and ends of the control step that has gone by; whether an episode ends."""
+        n = self.num_worlds
+        observed = np.empty((n, self._width))
+        reward = np.empty(n)
+        ends = np.empty((len(self._failures) + 2, n), dtype=np.bool_)
+        commanded = (offset, is_clipped, self.simulation.diverged(), self._periods)
+        is_over = self._sense_worlds(commanded, (observed, reward, ends))
+        if self._has_sensors:
+            self._sensors.measure(~commanded[2], self._sensor_inputs())
+            self._show_sensors(observed)
+        if self._has_further_terms:
+            for term in self.further_reward_terms(self.sample()).values():
+                reward += term
+        return observed, reward, ends, is_over
+
+    def _show_sensors(self, observed: Array) -> None:
+        """Fill the columns of further sensors."""
+        if self._has_sensors:
+            is_delayed = self._rules["is_delayed"][self._kind]
+            observed[:, -len(self._sensors.signals) :] = self._sensors.columns(is_delayed)
+
+    def _sensor_inputs(self) -> SensorInputs:
+        """What further sensors need of the truth; the specific force lags one physics step behind."""
+        truth = self._joints[self._row]["truth"]
+        has_force = ACCELEROMETER in self.config.sensors
+        sensordata = self.simulation.bind("sensordata") if has_force else None
+        return SensorInputs(
+            q=truth["q"].copy(),
+            joint_torque=spring_torque(truth),
+            specific_force=specific_force(self.model, sensordata, self.num_worlds),
+        )
+
+    def _describe(self, sample: Sample) -> dict[str, Any]:
+        """What a step tells of itself when somebody looks at it."""
+        clipped = sample.worlds["truth"]["clipped"].astype(np.float64)
+        return {"reward_terms": self.reward_terms(sample), **self.signals(sample), "clipped": clipped}
+
+    def _take_rows(self, count: int) -> None:
+        """Go on to fresh records, in a fresh block where this one is full: samples may keep the old one."""
+        if self._row + count >= len(self._joints):
+            self.score()
+            present = slice(self._row - 1, self._row + 1)
+            self._begin_block(self._joints[present], self._worlds[present])
+        self._row += count
+
+    def _begin_block(self, joints: Records, worlds: Records) -> None:
+        """Records for the next steps, behind those of the step before and of the present one."""
+        steps = self._steps_at_once + 2
+        self._joints = np.zeros((steps, *joints.shape[1:]), JOINT)
+        self._worlds = np.zeros((steps, self.num_worlds), self.world_type)
+        self._joints[:2] = joints
+        self._worlds[:2] = worlds
+        self._row = 1
+        self._unscored = 2
+
+    def _rehearse(self) -> None:
+        """Compile all kernels by a control step of records that nobody sees."""
+        every = np.ones(self.num_worlds, dtype=np.bool_)
+        offset, is_clipped = self._command(np.zeros((self.num_worlds, len(self._bound))))
+        self.simulation.ctrl[:] = 0.0
+        self._begin_worlds(every)
+        self._take_rows(1)
+        self._sense(offset, is_clipped)
+        self.observe()
+        self.signals()
+        self._begin_block(np.zeros_like(self._joints[:2]), np.zeros_like(self._worlds[:2]))
+
+    def _reasons(self, ends: BoolArray) -> npt.NDArray[np.str_]:
+        """Reason of termination of every world, the first that applies, "" where there is none."""
+        reasons = np.full(self.num_worlds, "", dtype=f"<U{max(map(len, self._failures))}")
+        for reason, failed in reversed([*zip(self._failures, ends, strict=False)]):
+            reasons[failed] = reason
+        return reasons
+
+    def _refused(self, given: npt.NDArray[Any]) -> ActionError:
+        """The error that says what is wrong with an action."""
+        shape = (self.num_worlds, len(self._bound))
+        bounds = f"within ±{self._bound.max():g} rad"
+        if given.dtype.kind not in "fiub":
+            return ActionError(f"an action must be real numbers, {bounds}, got an array of {given.dtype}")
+        if given.shape != shape:
+            # a scalar environment adds the axis of worlds itself
+            expected, found = (shape[1:], given.shape[1:]) if self._is_scalar else (shape, given.shape)
+            return ActionError(f"an action must have shape {expected} [rad], {bounds}; got shape {found}")
+        world = np.flatnonzero(~np.isfinite(given).all(axis=1))[0]
+        return ActionError(
+            f"an action must be finite, {bounds}, shape {shape[1:]} a world; got {given[world]} in world {world}"
+        )
+
+
+def spring_torque(truth: Records) -> Array:
+    """Torque of spring and damper on the links, from the truth of joints, (rows, n) [N·m]."""
+    return joint_torque(
+        truth["theta"] - truth["q"],
+        truth["theta_dot"] - truth["q_dot"],
+        truth["stiffness"],
+        truth["damping"],
+        truth["backlash"],
+    )

@@ -13,7 +13,6 @@ from gymnasium.vector.utils import batch_space
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.core.state import Stateful
 from elastic_env.runtime.envs import reset_mask
 from elastic_env.runtime.robot_model import RobotModel
 from elastic_env.runtime.task import Task
@@ -21,7 +20,7 @@ from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import in_common, make_shared_env
 
 
-class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
+class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """The worlds of several vector environments, one environment's after the other's.
 
     A policy costs hardly more for all of them than for those of one. The environments step side by side on threads,
@@ -39,8 +38,6 @@ class MixedVectorEnv(Stateful, gymnasium.vector.VectorEnv[Any, Any, Any]):
         ConfigurationError: None, different observations, tasks, motions or assumed joints, another autoreset mode, or
             not one weight per world.
     """
-
-    STATE = ("envs",)
 
     def __init__(
         self,

@@ -9,13 +9,12 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.state import Stateful
 from train.learn.finite import require_finite
 
 _NOTHING: dict[str, Any] = {}
 
 
-class SB3VecEnv(Stateful, VecEnv):
+class SB3VecEnv(VecEnv):
     """A Gymnasium vector environment with same-step autoreset as an SB3 `VecEnv`.
 
     Terminal observations, time limits (`TimeLimit.truncated`) and episode statistics (`episode`: reward r, length l in
@@ -30,8 +29,6 @@ class SB3VecEnv(Stateful, VecEnv):
     Raises:
         ConfigurationError: Another autoreset mode.
     """
-
-    STATE = ("env", "_stagger", "_reward", "_length", "_seeds")
 
     def __init__(
         self, env: gymnasium.vector.VectorEnv[Any, Any, Any], stagger: np.random.Generator | None = None
@@ -56,6 +53,11 @@ class SB3VecEnv(Stateful, VecEnv):
         self._reset_options()
         self._reward[:], self._length[:] = 0.0, 0
         return observation
+
+    def begin_with(self, seed: int, stagger: np.random.Generator) -> None:
+        """Seed the next `reset`, world i with seed + i, and the order in which it lets first episodes end early."""
+        self.seed(seed)
+        self._stagger = stagger
 
     def step_async(self, actions: Any) -> None:
         """Keep the actions for `step_wait`."""

@@ -1,4 +1,4 @@
-"""States in files: arrays and JSON, nothing is pickled. What a state holds is said by `elastic_env.core.state`."""
+"""States in files: arrays and JSON, nothing is pickled."""
 
 import json
 from pathlib import Path

@@ -63,7 +63,8 @@ class TrainConfig(Model):
     evaluation_episodes: int = quantity(
         "1", 4, ge=1, le=MOST_EPISODES, description="episodes per scenario in an evaluation"
     )
-    checkpoint_every: int = quantity("1", 10_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
+    checkpoint_every: int = quantity("1", 50_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
+    """A checkpoint ends all episodes: leave several of every world between two."""
 
     _kind = model_validator(mode="before")(is_a("training"))
     _checked = field_validator("base")(require_plain_base)

@@ -22,7 +22,6 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from baselines.residual.residual import ResidualDescription
-from elastic_env.core.state import given, taken
 from train.learn.algorithms import algorithm_class, options_named
 from train.learn.curves import Curves
 from train.learn.export import network_of
@@ -65,6 +64,7 @@ class Training(Trainer):
         worlds = training_worlds(config, config.shares, threads)
         self._joints = joints_of(worlds)
         self._worlds = SB3VecEnv(worlds, np.random.default_rng(seed))
+        self._seed = seed
         options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
         gamma = options.get("gamma", 0.99)
         self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
@@ -168,17 +168,10 @@ class Training(Trainer):
             "updates": model._n_updates,
             "episodes": model._episode_num,
             "best": float(self._scores.best) if np.isfinite(self._scores.best) else None,
-            "observation": model._last_obs,
-            "original": model._last_original_obs,
-            "starts": model._last_episode_starts,
             "normaliser": {name: [rms.mean, rms.var, float(rms.count)] for name, rms in statistics.items()},
-            "returns": normaliser.returns,
-            "old_observation": normaliser.old_obs,
-            "old_reward": normaliser.old_reward,
             "numpy": [numpy_state[0], numpy_state[1], *numpy_state[2:]],
             "python": _listed(random.getstate()),
-            "actions": taken(model.action_space.np_random, "the action space"),
-            "worlds": self._worlds.get_state(),
+            "actions": model.action_space.np_random.bit_generator.state,
         }
         if isinstance(model, OffPolicyAlgorithm):
             buffer = model.replay_buffer
@@ -193,18 +186,13 @@ class Training(Trainer):
         model.num_timesteps, model._n_updates = state["decisions"], state["updates"]
         model._episode_num = state["episodes"]
         self._scores.best = np.inf if state["best"] is None else state["best"]
-        model._last_obs, model._last_original_obs = state["observation"], state["original"]
-        model._last_episode_starts = state["starts"]
         rms: Any
         for name, rms in (("observation", normaliser.obs_rms), ("return", normaliser.ret_rms)):
             mean, var, count = state["normaliser"][name]
             rms.mean, rms.var, rms.count = mean, var, count
-        normaliser.returns = state["returns"]
-        normaliser.old_obs, normaliser.old_reward = state["old_observation"], state["old_reward"]
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
         random.setstate(_tupled(state["python"]))
-        given(model.action_space.np_random, state["actions"])
-        self._worlds.set_state(state["worlds"])
+        model.action_space.np_random.bit_generator.state = state["actions"]
         if model.ep_info_buffer is None:
             model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
         if isinstance(model, OffPolicyAlgorithm):
@@ -212,6 +200,25 @@ class Training(Trainer):
             for name, values in state["replay"].items():
                 getattr(buffer, name)[: len(values)] = values
             buffer.pos, buffer.full = state["replay_at"]
+        self._begin_episodes()
+
+    def checkpoint(self) -> None:
+        """See `Trainer`. A checkpoint holds no state of the worlds: it ends their episodes."""
+        super().checkpoint()
+        self._begin_episodes()
+
+    def _begin_episodes(self) -> None:
+        """End all episodes and begin others, with seeds that follow from the training seed and the decisions done."""
+        model = self.model
+        if isinstance(model, OffPolicyAlgorithm):  # the last transitions are of episodes that are cut
+            buffer: Any = model.replay_buffer
+            last = buffer.pos - 1
+            buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], np.logical_not(buffer.dones[last]))
+        entropy = np.random.SeedSequence((self._seed, self.done))
+        self._worlds.begin_with(FIRST_TRAINING_SEED + int(entropy.generate_state(1)[0]), np.random.default_rng(entropy))
+        model._last_obs = self._normaliser.reset()
+        model._last_original_obs = self._normaliser.get_original_obs()
+        model._last_episode_starts = np.ones(self.config.worlds, dtype=np.bool_)
 
     def _portion(self) -> int:
         """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on to its next update."""

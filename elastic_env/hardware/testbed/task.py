@@ -13,22 +13,21 @@ Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns
 `elastic_env.hardware.testbed.plant.CycleTiming`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from elastic_env.core.draws import Draws
-from elastic_env.core.signals import Array, BoolArray, IntArray, Signals
+from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.testbed.plant import ServoPlant
 from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.task import TestbedTask
-from elastic_env.runtime.joint_task import METRICS_OF_ONE, JointSample, JointTruth, Measurement
+from elastic_env.runtime.joint_task import METRICS_OF_ONE, JointTask, JointTruth
 from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.physics import Simulation
-from elastic_env.runtime.task import Outcome
+from elastic_env.runtime.rows import REAL, WHOLE, Records, record_type
+from elastic_env.runtime.sensors import AttitudeSensor
 
 TIMING_METRICS = (
     Metric("jitter_rms_s", "jitter", "rms", over="all"),
@@ -37,18 +36,15 @@ TIMING_METRICS = (
     Metric("missed_replies", "missed_replies", "max", over="all"),
     Metric("limited", "limited", "max", over="all"),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class HardwareSample(JointSample):
-    """What a step is scored by, and how well its period was kept, (1,) each."""
-
-    motor_torque: Array
-    jitter_s: Array
-    period_s: Array
-    overruns: IntArray
-    missed_replies: IntArray
-    limited: IntArray
+_CYCLE = record_type(
+    ("joint_torque", REAL),
+    ("jitter", REAL),
+    ("period", REAL),
+    ("overruns", WHOLE),
+    ("missed_replies", WHOLE),
+    ("limited", WHOLE),
+)
+_LINK = JointTask.world_type
 
 
 class HardwareTestbedTask(TestbedTask):
@@ -59,11 +55,15 @@ class HardwareTestbedTask(TestbedTask):
         settings: Wiring, mounting and limits.
     """
 
+    world_type = record_type(*((name, _LINK[name]) for name in _LINK.names or ()), ("cycle", _CYCLE))
+
     def __init__(self, config: TestbedConfig, settings: HardwareSettings) -> None:
-        super().__init__(config, num_worlds=1)
-        self.metrics: Sequence[Metric] = (*METRICS_OF_ONE, *TIMING_METRICS)
-        self.plant = ServoPlant(self.model, self._at, settings, config.control_period_s, config.pendulum.gravity_torque)
-        self._read_plant()
+        # the IMU is read in every cycle
+        imu = AttitudeSensor(rate_hz=1.0 / config.control_period_s)
+        super().__init__(config.replace(scenario=config.scenario.replace(imu=imu)), num_worlds=1)
+        self.metrics = (*METRICS_OF_ONE, *TIMING_METRICS)
+        at = JointAddresses.of(self.model, self.assumed_model.joint_names)
+        self.plant = ServoPlant(self.model, at, settings, config.control_period_s, config.pendulum.gravity_torque)
         extent, limits = config.reference.extent(), settings.limits
         if extent.lowest < limits.lowest_rad or extent.highest > limits.highest_rad:
             raise HardwareError(
@@ -71,50 +71,6 @@ class HardwareTestbedTask(TestbedTask):
                 f"the limits allow {limits.lowest_rad:g} to {limits.highest_rad:g} rad; lower its amplitude or widen "
                 "the limits"
             )
-
-    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
-        """Drive the testbed to its start and let it settle under zero offset."""
-        self._reference.draw(0, draws[0].robot)
-        self._step = np.zeros(1, dtype=np.int64)
-        self._offset, self._offset_before = np.zeros((2, 1, 1))
-        self._follow()
-        self._command = self._present.q.copy()
-        self.plant.begin(float(self._command[0, 0]))
-        self._read(simulation, worlds)
-        self._read_plant()
-        theta, q = self._state.theta, self._state.q
-        at_rest = Measurement(theta, theta, q)
-        self._measured = self._shown = at_rest
-
-    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
-        """Take the new measurements; behind the last step the pendulum is brought to rest."""
-        self._read_plant()  # before the way back to rest, which measures too
-        outcome = super().sense(simulation, diverged)
-        if outcome.is_over:
-            self.plant.finish()
-        return outcome
-
-    def sample(self) -> HardwareSample:
-        """See `TestbedTask`."""
-        measured = super().sample()
-        return HardwareSample(
-            *(getattr(measured, field.name) for field in fields(JointSample)),
-            motor_torque=self._motor_torque.copy(),
-            **{name: np.array([value]) for name, value in vars(self._timing).items()},
-        )
-
-    def signals(self, sample: JointSample) -> Signals:
-        """See `TestbedTask`, and the table of the module."""
-        assert isinstance(sample, HardwareSample)
-        return {
-            **super().signals(sample),
-            "joint_torque": sample.motor_torque.copy(),
-            "jitter": sample.jitter_s.copy(),
-            "period": sample.period_s.copy(),
-            "overruns": sample.overruns.copy(),
-            "missed_replies": sample.missed_replies.copy(),
-            "limited": sample.limited.copy(),
-        }
 
     def truth(self) -> JointTruth:
         """There is none on hardware.
@@ -124,12 +80,35 @@ class HardwareTestbedTask(TestbedTask):
         """
         raise HardwareError("hardware has no truth: the policy 'oracle' and scores by the true link need a simulation")
 
-    def _read_plant(self) -> None:
-        self._motor_torque, self._timing = self.plant.motor_torque.copy(), self.plant.timing
+    def _place(self, worlds: BoolArray) -> None:  # noqa: ARG002  there is one
+        """Drive the testbed to its start and let it settle under zero offset."""
+        self.plant.begin(float(self._reference.motion[0, 0, 0, 0]))
 
-    def _measure(self, worlds: BoolArray) -> Measurement:  # noqa: ARG002  there is one
-        """The encoder's change is that of a control period also where a cycle had to be repeated."""
-        theta, q = self._state.theta, self._state.q
-        change = theta - self._measured.encoder
-        periods = max(self.plant.timing.period_s / self.config.control_period_s, 1.0)
-        return Measurement(theta, theta - change / np.rint(periods), q)
+    def _begin_worlds(self, worlds: BoolArray) -> None:
+        super()._begin_worlds(worlds)
+        self._keep_cycle()
+
+    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
+        """Behind the last step the pendulum is brought to rest."""
+        is_over = super()._sense_worlds(commanded, results)
+        self._keep_cycle()  # before the way back to rest, which measures too
+        if is_over:
+            self.plant.finish()
+        return is_over
+
+    def _signals(self, joints: Records, worlds: Records) -> Signals:
+        """See the table of the module."""
+        cycle = worlds["cycle"]
+        return {**super()._signals(joints, worlds), **{name: cycle[name].copy() for name in _CYCLE.names or ()}}
+
+    @property
+    def _periods(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Several where a cycle had to be repeated."""
+        return float(np.rint(max(self.plant.timing.period_s / self.config.control_period_s, 1.0)))
+
+    def _keep_cycle(self) -> None:
+        timing = self.plant.timing
+        motor_torque: Array = self.plant.motor_torque
+        self._worlds[self._row]["cycle"] = (
+            motor_torque[0], timing.jitter_s, timing.period_s, timing.overruns, timing.missed_replies, timing.limited
+        )  # fmt: skip

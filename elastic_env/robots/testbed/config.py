@@ -77,11 +77,19 @@ def require_feasible(config: TestbedConfig) -> None:
     require_torque(config.reference, np.array([needed]), np.array([joint.servo.torque_limit]))
 
 
-def _rest_angle(theta: Array, factor: Parameter = 1.0, *, form: str, true: RobotModel, pendulum: Pendulum) -> Array:
+def _rest_angle(
+    theta: Array,
+    factor: Parameter = 1.0,
+    backlash: Array | None = None,
+    *,
+    form: str,
+    true: RobotModel,
+    pendulum: Pendulum,
+) -> Array:
     """Link angle at rest without friction; within the dead band the pendulum hangs straight down."""
     stiffness = true.rest_stiffness(form, factor)
     if np.isinf(stiffness).all():
         return theta
-    half = np.sign(theta) * true.backlash / 2.0
+    half = np.sign(theta) * (true.backlash if backlash is None else backlash) / 2.0
     engaged = np.where(np.abs(theta) > np.abs(half), theta - half, 0.0)
     return static_link_angle(engaged, stiffness, pendulum.torque, pendulum.torque_gradient, unique=False)

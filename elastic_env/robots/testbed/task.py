@@ -42,7 +42,7 @@ class TestbedTask(JointTask):
 
     __test__ = False
 
-    config: TestbedConfig
+    config: TestbedConfig  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, config: TestbedConfig, num_worlds: int) -> None:
         require_feasible(config)

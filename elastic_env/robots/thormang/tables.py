@@ -7,22 +7,12 @@ import numpy as np
 from elastic_env.core.signals import Mirrored, Signal, SignalGroup, SignalTable
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES
 from elastic_env.runtime.metrics import Metric
-
-ACTION_BOUND_RAD = 0.3
-"""Largest command offset [rad]."""
-
+from elastic_env.runtime.task import joint_groups
 
 JOINTS: Mapping[str, Mirrored] = {
     joint: "opposite" if joint.endswith(("_yaw", "_roll")) else "same" for joint in LEG_JOINTS
 }
 """The joints in order, and what an angle of theirs is in the mirror."""
-
-ACTION = SignalTable(
-    tuple(
-        Signal(f"command_offset.{joint}", "rad", f"θ_cmd − q_ref of {joint}", -ACTION_BOUND_RAD, ACTION_BOUND_RAD)
-        for joint in LEG_JOINTS
-    )
-)
 
 
 def _wrenches() -> tuple[Signal, ...]:
@@ -57,9 +47,11 @@ _TURNS: dict[str, Mirrored] = {"roll": "opposite", "pitch": "same"}
 _RATES: dict[str, Mirrored] = {"x": "opposite", "y": "same", "z": "opposite"}
 _of = SignalGroup.of
 
+_of_joints = {group.name: group for group in joint_groups(JOINTS)}
+
 GROUPS = (
-    _of("encoder_angle", "rad", "motor encoder, θ in whole counts, {part}", JOINTS, "measured"),
-    _of("encoder_rate", "rad/s", "its change over the last control period, {part}", JOINTS, "measured"),
+    _of_joints["encoder_angle"],
+    _of_joints["encoder_rate"],
     _of(
         "imu_attitude", "rad", "{part} of the pelvis by its IMU", _TURNS, "measured",
         noise=lambda scenario: scenario.pelvis_noise_rad,
@@ -72,13 +64,13 @@ GROUPS = (
         "wrench", _wrenches(), shape=(2, 2, 3),
         noise=lambda scenario: np.array([[scenario.force_noise_n] * 3, [scenario.moment_noise_nm] * 3]),
     ),
-    _of("reference_angle", "rad", "q_ref at the end of the coming control period, {part}", JOINTS, "reference"),
-    _of("reference_rate", "rad/s", "its rate, {part}", JOINTS, "reference"),
-    _of("reference_acceleration", "rad/s²", "its acceleration, {part}", JOINTS, "reference"),
+    _of_joints["reference_angle"],
+    _of_joints["reference_rate"],
+    _of_joints["reference_acceleration"],
     SignalGroup("clock", _clock(), shape=(3,)),
     _of("load_share", "1", "share of the weight on the right foot", {"right": "complement"}, "reference", shape=()),
     _of("zmp_reference", "m", "reference of the ZMP along {part}", {"x": "same", "y": "opposite"}, "reference"),
-    _of("last_command", "rad", "θ_cmd of the last control period, {part}", JOINTS, "command"),
+    _of_joints["last_command"],
 )  # fmt: skip
 """The observation; what a sensor shows, its noise and its mirror image are said here alone."""
 

@@ -61,17 +61,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from elastic_env.core.compiled import compile_now
-from elastic_env.core.draws import Draws
+from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
-from elastic_env.core.state import Stateful
-from elastic_env.dynamics import walk_kernels as kernels
+from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.dynamics.ground_contact import FootSensors
-from elastic_env.joint.elasticity import joint_torque
-from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.gait import LEFT, RIGHT
+from elastic_env.motion.trajectory import Plan, PlanTable
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
 from elastic_env.robots.thormang import NAME
 from elastic_env.robots.thormang.config import (
@@ -83,36 +80,29 @@ from elastic_env.robots.thormang.config import (
     require_stable_walker,
     robot_bank,
 )
-from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, biped
+from elastic_env.robots.thormang.model import SIDES, biped
 from elastic_env.robots.thormang.rows import (
-    ADDRESSES,
     BIAS,
+    COLUMNS,
     CONSTANTS,
     INERTIAL,
     NOISE,
-    OBSERVED,
     QUALITY,
     ROW_OF_PLAN,
-    RULES,
     SCORES,
-    STEP,
-    Records,
-    WalkSample,
+    WALK_RULES,
+    WORLD,
     WalkTruth,
-    one,
 )
-from elastic_env.robots.thormang.tables import ACTION, FELL, GROUPS, JOINTS, METRICS, OBSERVATION, PHASES
-from elastic_env.runtime.further_sensors import ACCELEROMETER, Felt, FurtherSensors, specific_force
-from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.physics import DIVERGED_RAD_S, Simulation, substeps
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.robots.thormang.tables import FELL, GROUPS, JOINTS, METRICS, OBSERVATION, PHASES
+from elastic_env.runtime.further_sensors import FurtherSensors
+from elastic_env.runtime.physics import DIVERGED_RAD_S
+from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.runtime.rows import RULES, Records, Sample, columns_of, one
 from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import InertialSensor, NoiseStream, angle_of_count, is_due
-from elastic_env.runtime.task import Outcome
+from elastic_env.runtime.sensors import InertialSensor, angle_of_count, is_due
+from elastic_env.runtime.task import Task, spring_torque
 
-FELL_ROW, NUM_ENDS = 1, 4
-"""Of what ends an episode, beside `elastic_env.runtime.task.DIVERGED_ROW` and those after it."""
-_ROWS_AT_ONCE = 64
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""
 
@@ -146,175 +136,164 @@ class _Kind:
         return list(dict.fromkeys((robot.is_delayed, robot.is_inertial) for robot in self.bank))
 
 
-class WalkTask(Stateful):
-    """Rules of `elastic_env/WalkInPlace-v0`, see `elastic_env.runtime.task.Task`."""
+class WalkTask(Task):
+    """Rules of `elastic_env/WalkInPlace-v0`: gait, contacts, pelvis and ZMP on top of the joints."""
 
-    STATE = (
-        "_bias", "_draw", "_push_force", "_push_begin", "_noise", "_sensors", "_rows", "_rows_before", "_offset",
-        "_has_fallen",
-    )  # fmt: skip
-
-    name = NAME
-    action_table = ACTION
-    assumed_model: RobotModel
-    metrics: Sequence[Metric] = METRICS
+    config: WalkConfig
+    assumed_model: WalkerModel
     failure_names: tuple[str, ...] = (FELL,)
+    world_type = WORLD
+    noise_type = NOISE
 
     def __init__(self, config: WalkConfig, num_worlds: int) -> None:
-        self.config = config
-        self.num_worlds = num_worlds
-        self.num_substeps = substeps(config.control_period_s, config.timestep_s)
         counts = next(iter(config.true_joints.values())).encoder_counts_per_turn
         scenarios = config.scenarios or (config.scenario,) * num_worlds
         if len(scenarios) != num_worlds:
             raise ConfigurationError(
                 f"scenario must be a name, or a list with one for each world, {num_worlds}, got {len(scenarios)}"
             )
-        self._sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
-        table = self.observation_table = OBSERVATION.extended(self._sensors.signals)
+        sensors = FurtherSensors(config.sensors, JOINTS, scenarios, counts)
+        table = OBSERVATION.extended(sensors.signals)
         robot = biped(config.robot)  # pyright: ignore[reportArgumentType]  frozen models can be hashed
         self.plan = plan_walk(config.gait, robot, config.control_period_s)  # pyright: ignore[reportArgumentType]
-        model = self.assumed_model = WalkerModel(
+        assumed = WalkerModel(
             config.assumed_joints, robot.rigid, config.control_period_s, table, biped=robot, plan=self.plan
         )
-        require_feasible(self.plan, robot, model.servos)
+        require_feasible(self.plan, robot, assumed.servos)
         self._kinds = [_Kind.of(own, self.plan, table) for own in config.of_each_scenario()]
+        self._fits = [(kind, *fit) for kind in self._kinds for fit in kind.fits]
+        super().__init__(
+            config=config,
+            name=NAME,
+            model=self._kinds[0].model,
+            assumed=assumed,
+            reference=PlanTable(_Walk(self.plan), config.control_period_s, num_worlds),
+            table=OBSERVATION.signals,
+            sensors=sensors,
+            metrics=METRICS,
+            rules=np.concatenate([_joint_rules(*fit) for fit in self._fits]),
+        )
         number = {kind.config.scenario: index for index, kind in enumerate(self._kinds)}
         self._kind_of_world = [self._kinds[number[scenario]] for scenario in scenarios]
-        self.model = self._kinds[0].model
         self._torso = self.model.body("upper_body").id
-        n, m = num_worlds, len(LEG_JOINTS)
-        self.num_steps = self.plan.num_steps
-        """Control steps of an episode."""
-        self._phases, self._bias = _phase_rows(self.plan), np.zeros(n, BIAS)
-        self._fits = [(kind, *fit) for kind in self._kinds for fit in kind.fits]
-        self._constants = np.concatenate([
-            _constants(kind, is_delayed, is_inertial) for kind, is_delayed, is_inertial in self._fits
-        ])  # fmt: skip
+        self._phases = _phase_rows(self.plan)
+        self._bias = np.zeros(num_worlds, BIAS)
+        self._walk_constants = np.concatenate([_constants(*fit) for fit in self._fits])
         self._inertial = _inertial(self._fits, robot.gravity)
         self._plan_rows = _plan_rows(self.plan, config)
-        self._draw = np.zeros(n, dtype=np.int64)
+        self._walk_columns = columns_of(OBSERVATION, COLUMNS)
         self._pushes = any(robot.push_n > 0.0 for kind in self._kinds for robot in kind.bank)
         self._push_steps = np.array([
             round(kind.config.scenario.push_s / config.control_period_s) for kind in self._kind_of_world
         ])  # fmt: skip
-        self._push_force, self._push_begin = np.zeros((n, 3)), np.full(n, -1, dtype=np.int64)
-        self._noise = NoiseStream(n, NOISE)
-        self._rows = self._rows_before = np.zeros(n, STEP)
-        self._rows_ahead, self._rows_left = np.zeros((0, n), STEP), 0
-        self._offset, self._has_fallen = np.zeros((n, m)), np.zeros(n, dtype=np.bool_)
+        self._push_force = np.zeros((num_worlds, 3))
+        self._push_begin = np.full(num_worlds, -1, dtype=np.int64)
         self._phases.flags.writeable = False
-        self._is_compiled = False
 
-    def restart(self, simulation: Simulation, worlds: BoolArray, draws: Sequence[Draws]) -> None:
-        """Place robots in static equilibrium under zero offset."""
+    def has_fallen(self) -> BoolArray:
+        """Worlds whose pelvis is too low or too much tilted, (num_worlds,)."""
+        truth = self._worlds[self._row]["truth"]
+        rules = self._walk_constants["rules"][self._kind]
+        is_down = (truth["pelvis"][:, 2] < rules["lowest_pelvis_m"]) | (truth["tilt"] > rules["highest_tilt_rad"])
+        return is_down & ~truth["diverged"]
+
+    def truth(self) -> WalkTruth:
+        """State without noise, and the true parameters."""
+        joints, body = self._joints[self._row]["truth"], self._worlds[self._row]["truth"]
+        return WalkTruth(
+            **{name: joints[name].copy() for name in ("theta", "theta_dot", "q", "q_dot", "stiffness")},
+            **{name: body[name].copy() for name in ("pelvis", "ankles")},
+            pelvis_R=rotation_of(body["quaternion"]),
+            models=tuple(kind.true_model for kind in self._kinds),
+        )
+
+    def _has_ranges(self, world: int) -> bool:
+        return bool(self._kind_of_world[world].config.scenario.ranges)
+
+    def _draw(self, world: int, random: EpisodeRandom) -> None:
+        generator = random.robot
+        kind, bias = self._kind_of_world[world], self._bias
+        robot = kind.bank[int(generator.integers(len(kind.bank)))]
+        self._take_robot(world, robot, kind.true_model)
+        mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
+        bias["imu_attitude"][world] = mounting + np.array(robot.imu_bias_rad)
+        self._draw_push(world, random)
+        self._noise.restart(world, random.noise())
+        self._kind[world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
+        self._draw_imu(world, generator)
+
+    def _draw_push(self, world: int, random: EpisodeRandom) -> None:
+        """Time and direction of the push, in the walk."""
+        walking = np.flatnonzero(self.plan.timing.walking)
+        begin = random.draw_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
+        direction = random.draw_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
+        self._push_begin[world] = begin
+        self._push_force[world] = self._robot(world).push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
+
+    def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
+        """Errors of an inertial IMU, where one is fitted."""
+        scenario, bias = self._kind_of_world[world].config.scenario, self._bias
+        sensor = _fitted(scenario, self._robot(world).is_inertial).inertial
+        bias["gyro"][world] = bias["specific_force"][world] = 0.0
+        if sensor is not None:
+            bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
+            bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
+            bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
+
+    def _placed(self, world: int) -> PlacedRobot:
+        """The robot of a world, at rest."""
+        config = self._kind_of_world[world].config
+        return placed_robot(config, self._robot(world))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
+
+    def _place(self, worlds: BoolArray) -> None:
+        simulation = self.simulation
         simulation.views(kernels.Physics._fields)
         simulation.bind("xfrc_applied")[worlds] = 0.0
-        # the samples of the steps before keep theirs
-        rows = self._rows.copy()
-        rows["scores"][worlds] = np.zeros((), SCORES)
-        truth = rows["truth"]
-        truth["step"][worlds], truth["contact_since"][worlds] = 0, -1
-        truth["offset"][worlds], truth["command_rate"][worlds] = 0.0, 0.0
-        truth["command"][worlds] = self.plan.q[0]
         for world in np.flatnonzero(worlds).tolist():
-            generator, kind = draws[world].robot, self._kind_of_world[world]
-            self._draw[world] = generator.integers(len(kind.bank))
-            mounting = kind.config.scenario.pelvis_imu.bias_spread_rad * generator.uniform(-1.0, 1.0, 2)
-            self._bias["imu_attitude"][world] = mounting + np.array(self._robot(world).imu_bias_rad)
-            self._draw_push(world, draws[world])
-            self._noise.restart(world, draws[world].noise())
-            self._place(simulation, world, truth)
-            self._draw_imu(world, generator)
+            placed = self._placed(world)
+            simulation.take(world, placed.model)
+            simulation.qpos[world] = placed.rest.qpos
+            simulation.qvel[world] = 0.0
+            simulation.act[world] = placed.rest.act
+            simulation.ctrl[world] = self.plan.q[0] - self._joints[self._row, world]["truth"]["homing"]
+            simulation.bind("qacc_warmstart")[world] = placed.rest.warmstart
         simulation.refresh(worlds)
-        if not self._is_compiled:
-            compile_now(self._rehearse, simulation)
-            self._is_compiled = True
-        kernels.begin(self._physics(simulation), self._walker, self._noise.ready(), worlds, rows)
-        self._rows, self._has_fallen = rows, self._has_fallen & ~worlds
-        self._rows_before = np.where(worlds, rows, self._rows_before)
-        if self._sensors:
-            self._sensors.restart(worlds, draws, self._felt(simulation))
 
-    def _rehearse(self, simulation: Simulation) -> None:
-        """Call all kernels on rows of their own."""
-        n, rows, samples = self.num_worlds, np.zeros((2, self.num_worlds), STEP), np.zeros((1, self.num_worlds), NOISE)
-        noise, physics = (samples, np.zeros(n, dtype=np.int64)), self._physics(simulation)
-        commanded = self._offset, np.zeros(n, dtype=np.bool_)
-        outcome = _observed(n)[1], np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_)
-        kernels.begin(physics, self._walker, noise, ~commanded[1], rows[0])
-        kernels.command(rows[0], self._offset, self._walker, np.zeros_like(simulation.ctrl))
-        kernels.control_step(physics, self._walker, noise, commanded, rows[0], rows[1], outcome)
-        kernels.show(rows[0], rows[1], self._walker, outcome[0])
-        self.signals(WalkSample(rows[0]))
-
-    def command(self, offset: Array, inputs: Array) -> None:
-        """θ_cmd = q_ref + offset, as the servos get it: they know their angles only up to the homing error."""
-        self._offset = offset
-        kernels.command(self._rows, offset, self._walker, inputs)
-
-    def disturb(self, simulation: Simulation) -> None:
+    def _disturb(self) -> None:
         """Push the torso where and when the scenario says."""
         if self._pushes:
-            since = self._rows["truth"]["step"] - self._push_begin
+            since = self._worlds[self._row]["truth"]["step"] - self._push_begin
             active = (since >= 0) & (since < self._push_steps)
-            simulation.bind("xfrc_applied")[:, self._torso, :3] = np.where(active[:, None], self._push_force, 0.0)
+            force = np.where(active[:, None], self._push_force, 0.0)
+            self.simulation.bind("xfrc_applied")[:, self._torso, :3] = force
 
-    def sense(self, simulation: Simulation, diverged: BoolArray) -> Outcome:
-        """Read the new state, then what the sensors show of it; score it."""
-        n, last, rows = self.num_worlds, self._rows, self._next_rows()
-        columns, observed = _observed(n)
-        reward, ends = np.empty(n), np.empty((NUM_ENDS, n), dtype=np.bool_)
-        is_over = kernels.control_step(
-            self._physics(simulation), self._walker, self._noise.ready(), (self._offset, diverged), last, rows,
-            (observed, reward, ends),
-        )  # fmt: skip
-        self._rows, self._rows_before = rows, last
-        self._has_fallen = ends[FELL_ROW]
-        if self._sensors:
-            self._sensors.measure(~diverged, self._felt(simulation))
-        return Outcome(self._observation(columns), WalkSample(rows), reward, ends, is_over)
+    def _begin_worlds(self, worlds: BoolArray) -> None:
+        steps = self._steps()
+        kernels.begin_walk(self._physics, self._constants, self._walker, self._noise.ready(), worlds, steps)
+        self._worlds[self._row]["scores"][worlds] = np.zeros((), SCORES)
 
-    def _next_rows(self) -> Records:
-        """Rows for a control step, of which samples may keep them: several are made at once, which costs less."""
-        if self._rows_left == 0:
-            self._rows_ahead = np.zeros((max(_ROWS_AT_ONCE // self.num_worlds, 1), self.num_worlds), STEP)
-            self._rows_left = len(self._rows_ahead)
-        self._rows_left -= 1
-        return self._rows_ahead[self._rows_left]
+    def _sense_worlds(self, commanded: tuple[Any, ...], results: tuple[Any, ...]) -> bool:
+        noise = self._noise.ready()
+        joints, steps = self._constants, self._steps()
+        return kernels.sense_walk(self._physics, joints, self._walker, noise, commanded, steps, results)
 
-    def observe(self) -> Array:
-        """See the table of the module."""
-        columns, observed = _observed(self.num_worlds)
-        kernels.show(self._rows, self._rows_before, self._walker, observed)
-        return self._observation(columns)
+    def _show_worlds(self, observed: Array) -> None:
+        kernels.show_walk(self._constants, self._walker, self._steps(), observed)
 
-    def _observation(self, columns: Array) -> Array:
-        """The standard columns of an observation and what further sensors show."""
-        if not self._sensors:
-            return columns
-        is_delayed = self._constants["rules"]["is_delayed"][self._bias["fit"]]
-        return np.hstack([columns, self._sensors.columns(is_delayed)])
+    @property
+    def _physics(self) -> tuple[Any, ...]:
+        """`kernels.Physics`."""
+        return self.simulation.views(kernels.Physics._fields)
 
-    def _felt(self, simulation: Simulation) -> Felt:
-        """What further sensors feel; the specific force lags one physics step behind."""
-        truth = self._rows["truth"]
-        deflection, rate = truth["theta"] - truth["q"], truth["theta_dot"] - truth["q_dot"]
-        torque = joint_torque(deflection, rate, truth["stiffness"], truth["damping"], truth["backlash"])
-        has_force = ACCELEROMETER in self.config.sensors
-        force = specific_force(self.model, simulation.bind("sensordata")) if has_force else np.zeros((len(truth), 3))
-        return Felt(truth["q"].copy(), torque, force)
+    @property
+    def _walker(self) -> tuple[Any, ...]:
+        """`kernels.Walker`."""
+        return self._walk_constants, self._plan_rows, self._bias, self._inertial, self._walk_columns
 
-    def sample(self) -> WalkSample:
-        """What this step is scored by."""
-        return WalkSample(self._rows)
-
-    def signals(self, sample: WalkSample) -> Signals:
-        """Truth and scores of samples, one value per row."""
-        truth, row, plan, timing = sample.rows["truth"], self._row(sample), self.plan, self.plan.timing
-        error, deflection = plan.q[row] - truth["q"], truth["theta"] - truth["q"]
-        deflection_rate = truth["theta_dot"] - truth["q_dot"]
-        torque = joint_torque(deflection, deflection_rate, truth["stiffness"], truth["damping"], truth["backlash"])
+    def _signals(self, joints: Records, worlds: Records) -> Signals:
+        truth, plan, timing = worlds["truth"], self.plan, self.plan.timing
+        row = self._plan_row(truth)
+        error, deflection = joints["q_ref"] - joints["q"], joints["theta"] - joints["q"]
         zmp_ref = plan.zmp[row]
         deviation = truth["zmp"] - zmp_ref
         return {
@@ -334,8 +313,8 @@ class WalkTask(Stateful):
             "link_error_lowest": -highest(-error),
             "link_error_highest": highest(error),
             "deflection": rms(deflection),
-            "joint_torque": highest(np.abs(torque)),
-            "servo_torque": rms(truth["servo_torque"]),
+            "joint_torque": highest(np.abs(spring_torque(joints))),
+            "servo_torque": truth["servo_torque"].copy(),
             "command_rate": truth["command_rate"].copy(),
             "force_left": truth["force"][:, LEFT].copy(),
             "force_right": truth["force"][:, RIGHT].copy(),
@@ -346,14 +325,11 @@ class WalkTask(Stateful):
             "early_touchdown": self._earliness(truth, row),
         }
 
-    def reward_terms(self, sample: WalkSample) -> dict[str, Array]:
-        """Weighted penalties for tilt, ZMP deviation, effort, restless commands and a fall."""
-        return {name: sample.rows["scores"][name].copy() for name in SCORES.names or ()}
-
-    def masks(self, sample: WalkSample) -> dict[str, BoolArray]:
+    def masks(self, sample: Sample) -> dict[str, BoolArray]:
         """The walk (standing before and after it does not count), its phases, and where there is a ZMP."""
-        loaded = ~np.isnan(sample.rows["truth"]["zmp"][:, 0])
-        phases = self._phases[:, self._row(sample)]
+        truth = sample.worlds["truth"]
+        loaded = ~np.isnan(truth["zmp"][:, 0])
+        phases = self._phases[:, self._plan_row(truth)]
         names = [f"{name}_loaded" for name in PHASES]
         return {
             **dict(zip(["scored", *PHASES, "touchdown"], phases, strict=True)),
@@ -361,82 +337,9 @@ class WalkTask(Stateful):
             "unloaded": phases[0] & ~loaded,
         }
 
-    def has_fallen(self) -> BoolArray:
-        """Worlds whose pelvis is too low or too much tilted, (num_worlds,)."""
-        return self._has_fallen
-
-    def truth(self) -> WalkTruth:
-        """State without noise, and the true parameters."""
-        s = self._rows["truth"]
-        names = "theta", "theta_dot", "q", "q_dot", "pelvis", "ankles", "stiffness"
-        copies = {name: s[name].copy() for name in names}
-        models = tuple(kind.true_model for kind in self._kinds)
-        return WalkTruth(**copies, pelvis_R=rotation_of(s["quaternion"]), models=models)
-
-    def robot_record(self, world: int) -> dict[str, float]:
-        """The robot of a world in figures, where it was drawn from ranges; else nothing."""
-        return self._robot(world).record() if self._kind_of_world[world].config.scenario.ranges else {}
-
-    def _row(self, sample: WalkSample) -> IntArray:
+    def _plan_row(self, truth: Records) -> IntArray:
         """Rows of the plan's tables."""
-        return np.minimum(sample.rows["truth"]["step"], self.num_steps)
-
-    def _physics(self, simulation: Simulation) -> tuple[Any, ...]:
-        """`kernels.Physics`."""
-        return simulation.views(kernels.Physics._fields)
-
-    @property
-    def _walker(self) -> tuple[Any, ...]:
-        """`kernels.Walker`."""
-        return self._constants, self._plan_rows, self._bias, self._inertial
-
-    def _draw_push(self, world: int, draws: Draws) -> None:
-        """Time and direction of the push, in the walk."""
-        walking = np.flatnonzero(self.plan.timing.walking)
-        begin = draws.of_trial(lambda generator: generator.integers(walking[0], walking[-1] + 1))
-        direction = draws.of_trial(lambda generator: generator.uniform(0.0, 2.0 * np.pi))
-        self._push_begin[world] = begin
-        self._push_force[world] = self._robot(world).push_n * np.array([np.cos(direction), np.sin(direction), 0.0])
-
-    def _draw_imu(self, world: int, generator: np.random.Generator) -> None:
-        """Errors of an inertial IMU, where one is fitted."""
-        scenario, bias = self._kind_of_world[world].config.scenario, self._bias
-        sensor = _fitted(scenario, self._robot(world).is_inertial).inertial
-        bias["gyro"][world] = bias["specific_force"][world] = 0.0
-        if sensor is not None:
-            bias["imu_attitude"][world] += sensor.offset_rad * generator.standard_normal(2)
-            bias["gyro"][world] = sensor.gyro_bias_rad_s * generator.standard_normal(3)
-            bias["specific_force"][world] = sensor.accelerometer_bias_m_s2 * generator.standard_normal(3)
-
-    def _robot(self, world: int) -> RobotDraw:
-        """The robot of a world."""
-        return self._kind_of_world[world].bank[self._draw[world]]
-
-    def furnish(self, simulation: Simulation) -> None:
-        """See `Task`."""
-        for world in range(self.num_worlds):
-            simulation.take(world, self._placed(world).model)
-
-    def _placed(self, world: int) -> PlacedRobot:
-        """The robot of a world, at rest."""
-        config = self._kind_of_world[world].config
-        return placed_robot(config, self._robot(world))  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-
-    def _place(self, simulation: Simulation, world: int, truth: Records) -> None:
-        """Give a world its robot, at rest, and its truth the robot's joints."""
-        robot, kind, bias = self._robot(world), self._kind_of_world[world], self._bias
-        model, placed = kind.true_model, self._placed(world)
-        bias["encoder"][world] = robot.encoder_bias_rad
-        bias["fit"][world] = self._fits.index((kind, robot.is_delayed, robot.is_inertial))
-        simulation.take(world, placed.model)
-        simulation.qpos[world] = placed.rest.qpos
-        simulation.qvel[world] = 0.0
-        simulation.act[world] = placed.rest.act
-        simulation.ctrl[world] = self.plan.q[0] - bias["encoder"][world]
-        simulation.bind("qacc_warmstart")[world] = placed.rest.warmstart
-        truth["stiffness"][world] = model.stiffness * np.array(robot.stiffness_factor)
-        truth["damping"][world] = model.damping * robot.damping_factor
-        truth["backlash"][world] = model.backlash + robot.backlash_rad
+        return np.minimum(truth["step"], self.num_steps)
 
     def _earliness(self, truth: Records, row: IntArray) -> Array:
         """By how much the swing foot of the last swing touched down before its time [s]."""
@@ -444,11 +347,24 @@ class WalkTask(Stateful):
         return np.where(self._phases[TOUCHDOWN, row] & (truth["contact_since"] >= 0), early, 0.0)
 
 
+@dataclass(frozen=True)
+class _Walk:
+    """A walk plan as the joints' reference, the same in all episodes."""
+
+    walk: WalkPlan
+    is_random = False
+
+    def plan(self, generator: np.random.Generator, control_period_s: float) -> Plan:  # noqa: ARG002  there is one
+        """See `Planned`."""
+        scored = self.walk.timing.walking
+        nowhere = np.full(len(scored), -1, dtype=np.int64)
+        return Plan(self.walk.q, self.walk.q_dot, self.walk.q_ddot, scored, nowhere)
+
+
 def _plan_rows(plan: WalkPlan, config: WalkConfig) -> Records:
     """What a control step needs of the plan, one row per step."""
     timing, steps = plan.timing, np.arange(plan.num_steps + 1)
     rows = np.zeros(len(steps), ROW_OF_PLAN)
-    rows["q"], rows["q_dot"], rows["q_ddot"] = plan.q, plan.q_dot, plan.q_ddot
     rows["clock"] = np.column_stack([timing.time, timing.swing, timing.support])
     rows["share"], rows["zmp"] = plan.share, plan.zmp
     rows["half_of_swing"], rows["swing_foot"] = _halves_of_swing(plan), RIGHT - timing.support
@@ -473,14 +389,20 @@ def _halves_of_swing(plan: WalkPlan) -> IntArray:
     return np.where(timing.single, np.where(timing.swing > 0.5, kernels.SECOND_HALF, kernels.FIRST_HALF), 0)
 
 
-def _observed(n: int) -> tuple[Array, Records]:
-    """Columns of an observation to be filled, (n, columns), and the same memory as rows of `OBSERVED`, (n,)."""
-    columns = np.empty((n, len(OBSERVATION)))
-    return columns, np.ndarray(n, OBSERVED, columns)
+def _joint_rules(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001  of all sensors
+    """One record of `RULES`; arguments as `_constants`."""
+    counts = kind.true_model.encoder_counts_per_turn if kind.config.scenario.encoder_counts else None
+    return one(
+        RULES,
+        control_period_s=kind.config.control_period_s,
+        is_delayed=is_delayed,
+        count_rad=angle_of_count(counts),
+        highest_rad_s=DIVERGED_RAD_S,
+    )
 
 
-def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:
-    """What does not change of a robot, one row of `CONSTANTS`.
+def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:  # noqa: ARG001  that is of the joints
+    """What does not change of a robot, one record of `CONSTANTS`.
 
     Args:
         kind: Robots of its scenario.
@@ -490,30 +412,25 @@ def _constants(kind: _Kind, is_delayed: bool, is_inertial: bool) -> Records:
     config, model = kind.config, kind.model
     feet = [model.body(f"{side}_foot").id for side in SIDES]
     sensors = FootSensors(model.body_mass[feet], model.body_ipos[feet], model.opt.gravity.copy())
-    joints, gravity = JointAddresses.of(model, LEG_JOINTS), biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
-    at = one(
-        ADDRESSES, theta=joints.theta, q=joints.q, theta_dot=joints.theta_dot, q_dot=joints.q_dot,
-        ankles=np.array([model.site(f"{side}_ft").id for side in SIDES]),
-    )  # fmt: skip
+    gravity = biped(config.robot).gravity  # pyright: ignore[reportArgumentType]  frozen models can be hashed
     loaded_n = UNLOADED_SHARE * float(model.body_mass.sum()) * gravity
-    # sensors that carry nothing stand for a ground that carries the feet
-    zmp_n = loaded_n + float(model.body_mass[feet].sum()) * gravity
+    rules = one(
+        WALK_RULES,
+        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m,
+        highest_tilt_rad=FALL_TILT_RAD,
+        loaded_n=loaded_n,
+        # sensors that carry nothing stand for a ground that carries the feet
+        zmp_n=loaded_n + float(model.body_mass[feet].sum()) * gravity,
+        weights=one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()}),
+    )
     return one(
-        CONSTANTS, at=at, foot_com=sensors.com, foot_weight=sensors.weight,
-        quality=_quality(_fitted(config.scenario, is_inertial), kind.true_model.encoder_counts_per_turn),
-        rules=_rules(config, is_delayed, loaded_n, zmp_n),
-    )  # fmt: skip
-
-
-def _rules(config: WalkConfig, is_delayed: bool, loaded_n: float, zmp_n: float) -> Records:
-    """Numbers that judge a control step, one row of `RULES`."""
-    weights = one(SCORES, **{name: getattr(config.reward, name) for name in SCORES.names or ()})
-    return one(
-        RULES, control_period_s=config.control_period_s, is_delayed=is_delayed,
-        loaded_n=loaded_n, zmp_n=zmp_n, weights=weights,
-        lowest_pelvis_m=FALL_HEIGHT_SHARE * config.gait.hip_height_m, highest_tilt_rad=FALL_TILT_RAD,
-        highest_rad_s=DIVERGED_RAD_S,
-    )  # fmt: skip
+        CONSTANTS,
+        at=one(CONSTANTS["at"], ankles=[model.site(f"{side}_ft").id for side in SIDES]),
+        foot_com=sensors.com,
+        foot_weight=sensors.weight,
+        quality=_quality(_fitted(config.scenario, is_inertial)),
+        rules=rules,
+    )
 
 
 def _fitted(scenario: Scenario, is_inertial: bool) -> Scenario:
@@ -534,16 +451,13 @@ def _inertial(fits: Sequence[tuple[_Kind, bool, bool]], gravity_m_s2: float) -> 
     ])  # fmt: skip
 
 
-def _quality(scenario: Scenario, counts_per_turn: int | None) -> Records:
+def _quality(scenario: Scenario) -> Records:
     """Quality of the sensors in a scenario, one row of `QUALITY`."""
     imu, noise = scenario.pelvis_imu, np.zeros(1, NOISE)
     for group in GROUPS:
         if group.noise is not None:
             noise[group.name] = group.noise(scenario)
-    return one(
-        QUALITY, count_rad=angle_of_count(counts_per_turn if scenario.encoder_counts else None), noise=noise,
-        imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad,
-    )  # fmt: skip
+    return one(QUALITY, noise=noise, imu_bias_rad=imu.bias_rad, imu_sine_error_rad=imu.sine_error_rad)
 
 
 def _true_model(config: WalkConfig, plan: WalkPlan, table: SignalTable) -> WalkerModel:

@@ -1,4 +1,4 @@
-"""What is drawn at random when an episode begins: the robot, which can walk again, and what happens to it then.
+"""Random generators of an episode: for the robot, which can walk again, and for what happens to it then.
 
 A robot is what lasts: its joints, the offsets of its sensors, the ground under it, and where a motion is drawn, the
 motion. A trial is what does not: noise, pushes. `reset(options={"robot_seed": s})` begins a trial of the robot that
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Draws:
+class EpisodeRandom:
     """Generators of one world's new episode.
 
     Attributes:
@@ -26,7 +26,7 @@ class Draws:
     robot: np.random.Generator
     trial: np.random.Generator | None = None
 
-    def of_trial(self, draw: Callable[[np.random.Generator], T]) -> T:
+    def draw_trial(self, draw: Callable[[np.random.Generator], T]) -> T:
         """Something that differs from trial to trial.
 
         It is drawn of both, so that what is drawn of the robot afterwards is the same in all its trials.
@@ -36,4 +36,4 @@ class Draws:
 
     def noise(self) -> np.random.Generator:
         """A generator of its own for noise."""
-        return np.random.default_rng(self.of_trial(lambda generator: int(generator.integers(2**63))))
+        return np.random.default_rng(self.draw_trial(lambda generator: int(generator.integers(2**63))))

@@ -1,0 +1,114 @@
+"""Records of a control step: one per joint and one per world, with their fields by name.
+
+NumPy's structured types, which Numba compiles as they stand: `joints[world, i].truth.theta` in a kernel,
+`joints["truth"]["theta"]` in NumPy. A joint is a record, so the code that is compiled serves any number of joints.
+Truth is what the physics did. Measurements are what sensors show of it. Nothing is in both.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from elastic_env.core.signals import SignalTable
+from elastic_env.joint.joint_names import JointAddresses, servo_name
+
+Records: TypeAlias = npt.NDArray[Any]
+"""An array of one of these types."""
+
+REAL = np.float64
+WHOLE = np.int64
+
+
+def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
+    """A structured type whose records have their fields as attributes, compiled or not."""
+    return np.dtype((np.record, list(fields)))
+
+
+JOINT = record_type(
+    ("truth", record_type(
+        ("q_ref", REAL),  # [rad]
+        ("theta", REAL), ("theta_dot", REAL),  # motor side [rad], [rad/s]
+        ("q", REAL), ("q_dot", REAL),  # link side [rad], [rad/s]
+        ("offset", REAL), ("command", REAL),  # a, and θ_cmd = q_ref + a [rad]
+        ("command_rate", REAL),  # change of a [rad/s]
+        ("stiffness", REAL), ("damping", REAL),  # true K [N·m/rad] and D [N·m·s/rad]
+        ("backlash", REAL),  # dead band [rad]
+        ("homing", REAL),  # what the encoder shows beyond θ [rad]
+    )),
+    ("shown", record_type(("encoder", REAL), ("encoder_before", REAL))),  # now and one control step ago [rad]
+)  # fmt: skip
+"""A joint in a control step. What is true of its spring and its encoder is drawn per episode."""
+
+COURSE: Any = (
+    ("step", WHOLE),  # control steps since the start of the episode
+    ("command_rate", REAL),  # rms over the joints [rad/s]
+    ("clipped", np.bool_),  # whether the action was beyond its bounds
+    ("diverged", np.bool_),  # whether the world has no new state
+)
+"""Fields that the truth of every world has."""
+
+RULES = record_type(
+    ("control_period_s", REAL),
+    ("is_delayed", np.bool_),  # whether measurements are shown a step late
+    ("count_rad", REAL),  # of the encoders, 0 for none
+    ("highest_rad_s", REAL),  # beyond it the simulation has diverged
+)
+"""Rules of the joints of a world."""
+
+ADDRESS = record_type(
+    ("theta", WHOLE), ("q", WHOLE),  # in qpos
+    ("theta_dot", WHOLE), ("q_dot", WHOLE),  # in qvel
+    ("servo", WHOLE),  # in ctrl
+)  # fmt: skip
+"""Where a joint stands in the physics."""
+
+JOINT_COLUMNS = (
+    "encoder_angle",
+    "encoder_rate",
+    "reference_angle",
+    "reference_rate",
+    "reference_acceleration",
+    "last_command",
+)
+"""Groups of an observation that have a column for every joint."""
+
+
+class Sample(NamedTuple):
+    """Control steps as they are scored, one or several, which nothing changes later.
+
+    Attributes:
+        joints: Of `JOINT`, (rows, n).
+        worlds: Of the task's `WORLD`, (rows,).
+    """
+
+    joints: Records
+    worlds: Records
+
+
+def one(kind: np.dtype[Any], **values: Any) -> Records:
+    """One record with these values, (1,)."""
+    row = np.zeros(1, kind)
+    for name in row.dtype.names or ():
+        row[name] = values.pop(name)
+    assert not values
+    row.flags.writeable = False
+    return row
+
+
+def addresses(model: mujoco.MjModel, joints: Sequence[str]) -> Records:
+    """Records of `ADDRESS`, (n,)."""
+    known = JointAddresses.of(model, joints)
+    found = np.zeros(len(joints), ADDRESS)
+    for name in ("theta", "q", "theta_dot", "q_dot"):
+        found[name] = getattr(known, name)
+    found["servo"] = [model.actuator(servo_name(joint)).id for joint in joints]
+    return found
+
+
+def columns_of(table: SignalTable, groups: Sequence[str]) -> Records:
+    """First column of each of some groups, one record."""
+    kind = record_type(*((group, WHOLE) for group in groups))
+    return one(kind, **{group: table.group(group).start for group in groups})
