@@ -1,4 +1,4 @@
-"""Processes that must not wait for others, and the time they keep."""
+"""Real-time scheduling of processes, and the clock of a control loop."""
 
 import contextlib
 import gc
@@ -6,11 +6,14 @@ import os
 import time
 from enum import IntEnum
 
-from elastic_env.hardware.safety.bounds import exceeds
+from elastic_env.hardware.safety.comparisons import exceeds
+
+LONGEST_WAIT_S = 0.02
+"""How far ahead a control cycle may ask to be read [s]."""
 
 
 class Priority(IntEnum):
-    """Who goes before whom: what ends a motion before what moves, however busy that is."""
+    """Order of the processes: those that end a motion go before those that move, however busy these are."""
 
     LOOP = 5
     IMU_READER = 10
@@ -76,7 +79,8 @@ class Pace:
 
     def restart(self) -> None:
         """A period begins now."""
-        self._due_s, self._lost_s = time.monotonic(), 0.0
+        self._due_s = time.monotonic()
+        self._lost_s = 0.0
 
     def next(self) -> float:
         """When to read, for a command that is ready now: not before now [s, monotonic clock]."""

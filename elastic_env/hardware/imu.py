@@ -1,7 +1,7 @@
 """The link's attitude from a MicroStrain IMU, read by a process of its own; a stream that stalls is an error.
 
 The maker's library keeps Python's lock while it waits, which would hold the control loop up, hence the process. The
-newest sample lies in shared memory with its time; a counter around each write, odd while it lasts, keeps halves of two
+newest sample lies in shared memory with its time. A counter around each write, odd while it lasts, keeps halves of two
 samples apart.
 """
 
@@ -12,13 +12,18 @@ import struct
 import subprocess
 import time
 from contextlib import AbstractContextManager
+from dataclasses import astuple, dataclass
+from typing import Literal
 
+from elastic_env.hardware.buses.port_lock import lock_port
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.imu.attitude_sample import Attitude, Axis, PlausibleAttitudes
-from elastic_env.hardware.safety.bounds import is_outside
-from elastic_env.hardware.safety.child_process import child_command, child_environment
-from elastic_env.hardware.servo_bus.port_lock import lock_port
+from elastic_env.hardware.safety.comparisons import is_outside
+from elastic_env.hardware.safety.processes import child_command, child_environment
 
+Axis = Literal["roll", "pitch", "yaw"]
+
+_RANGE_RAD: dict[Axis, float] = {"roll": math.pi, "pitch": math.pi / 2.0, "yaw": math.pi}
+_ROUNDING_RAD = 1e-4  # the IMU sends 32 bits
 _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")
 _SIZE = _COUNTER.size + _SAMPLE.size
@@ -27,6 +32,61 @@ _TRIES = 100
 
 class AttitudeError(HardwareError):
     """The IMU cannot be opened, sends nothing or what it cannot have measured, or has stopped sending."""
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """One sample: Euler angles of the maker's north-east-down convention [rad], and when it came in [s, monotonic]."""
+
+    time_s: float
+    roll: float
+    pitch: float
+    yaw: float
+
+    def link_angle(self, axis: Axis, sign: int, offset_rad: float) -> float:
+        """Link angle [rad], from −π to π: sign · (Euler angle − offset), the offset being that of the IMU at q = 0."""
+        return math.remainder(sign * (getattr(self, axis) - offset_rad), 2.0 * math.pi)
+
+
+class PlausibleAttitudes:
+    """Looks at the attitudes that come, one after the other, for those that cannot have been measured.
+
+    An IMU marks as valid what its filter has computed, right or not. A filter that stands still goes on sending its
+    last angles. Those of a working one should not be equal in all bits: a gyroscope of some 0.005 °/s/√Hz turns an
+    angle by about 10 µrad from packet to packet at 100 Hz, and a bit is at most 0.24 µrad. So three angles that stay
+    the same are no newer than when they first came, and have the age at which any attitude counts as missing.
+
+    Args:
+        oldest_s: Age at which an attitude counts as missing [s].
+    """
+
+    def __init__(self, oldest_s: float) -> None:
+        self._oldest_s = oldest_s
+        self._first: Attitude | None = None
+        """First sample with the angles of the last one."""
+
+    def check(self, sample: Attitude) -> str:
+        """Take the newest sample.
+
+        Returns:
+            What is wrong with it, and what to look at; "" if nothing.
+        """
+        for name, end in _RANGE_RAD.items():
+            angle = getattr(sample, name)
+            if is_outside(angle, -end - _ROUNDING_RAD, end + _ROUNDING_RAD):
+                return (
+                    f"sends {name} = {angle:g} rad and calls it valid; it must lie between {-end:.4f} and {end:.4f} "
+                    "rad: switch the IMU off and on, and look at the settings of its filter"
+                )
+        if self._first is None or astuple(sample)[1:] != astuple(self._first)[1:]:
+            self._first = sample
+        same_s = sample.time_s - self._first.time_s
+        if is_outside(same_s, 0.0, self._oldest_s):
+            return (
+                f"has sent the same attitude in all bits for {1e3 * same_s:.0f} ms, {1e3 * self._oldest_s:.0f} ms are "
+                "allowed (imu_oldest_s): its filter stands still; switch the IMU off and on"
+            )
+        return ""
 
 
 class SharedSample:
@@ -49,9 +109,9 @@ class SharedSample:
 
     def put(self, sample: Attitude) -> None:
         """Replace the sample."""
-        (counter,) = _COUNTER.unpack_from(self._memory)
+        counter = self._counter()
         _COUNTER.pack_into(self._memory, 0, counter + 1)
-        _SAMPLE.pack_into(self._memory, _COUNTER.size, sample.time_s, sample.roll, sample.pitch, sample.yaw)
+        _SAMPLE.pack_into(self._memory, _COUNTER.size, *astuple(sample))
         _COUNTER.pack_into(self._memory, 0, counter + 2)
 
     def get(self) -> Attitude | None:
@@ -60,13 +120,15 @@ class SharedSample:
         Where a write does not come to its end, because its process died or waits, it is the one before.
         """
         for _ in range(_TRIES):
-            (before,) = _COUNTER.unpack_from(self._memory)
+            before = self._counter()
             values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
-            (after,) = _COUNTER.unpack_from(self._memory)
-            if before == after and before % 2 == 0:
+            if before == self._counter() and before % 2 == 0:
                 self._last = Attitude(*values) if before else None
                 break
         return self._last
+
+    def _counter(self) -> int:
+        return _COUNTER.unpack_from(self._memory)[0]
 
 
 class AttitudeStream(AbstractContextManager["AttitudeStream"]):
@@ -84,37 +146,38 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
     """
 
     def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0) -> None:
-        self.port, self._oldest_s = port, oldest_s
+        self.port = port
+        self._oldest_s = oldest_s
         self._plausible = PlausibleAttitudes(oldest_s)
         self._lock: int | None = lock_port(port)
         self._process: subprocess.Popen[str] | None = None
         try:
-            self._shared = self._begin(port, baudrate)
+            self._shared = self._start(port, baudrate)
             deadline = time.monotonic() + wait_s
             while self._shared.get() is None:
-                if self._has_ended or time.monotonic() > deadline:
-                    raise self._silent()
+                if self._process is None or self._process.poll() is not None or time.monotonic() > deadline:
+                    raise self._silence()
                 time.sleep(0.01)
         except BaseException:
             self.close()
             raise
 
-    def _begin(self, port: str, baudrate: int) -> SharedSample:
+    def _start(self, port: str, baudrate: int) -> SharedSample:
         """Start the reader."""
         file = SharedSample.file()
         try:
             self._process = subprocess.Popen(
-                child_command("elastic_env.hardware.imu.attitude_reader", str(file), port, str(baudrate)),
-                env=child_environment(), pass_fds=[file], stdin=subprocess.PIPE, stderr=subprocess.PIPE,
-                text=True, start_new_session=True,
-            )  # fmt: skip
+                child_command("elastic_env.hardware.imu_reader", str(file), port, str(baudrate)),
+                env=child_environment(),
+                pass_fds=[file],
+                stdin=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
+            )
             return SharedSample(file)
         finally:
             os.close(file)
-
-    @property
-    def _has_ended(self) -> bool:
-        return self._process is None or self._process.poll() is not None
 
     def latest(self) -> Attitude:
         """The newest sample.
@@ -124,15 +187,18 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         """
         sample = self._shared.get()
         if sample is None or is_outside(time.monotonic() - sample.time_s, 0.0, self._oldest_s):
-            raise self._silent(sample)
-        if problem := self._plausible.problem(sample):
+            raise self._silence(sample)
+        problem = self._plausible.check(sample)
+        if problem:
             raise AttitudeError(f"the IMU at {self.port} {problem}")
         return sample
 
     def close(self) -> None:
         """End the reader, and give the port back; a second time does nothing."""
-        process, self._process = self._process, None
-        lock, self._lock = self._lock, None
+        process = self._process
+        lock = self._lock
+        self._process = None
+        self._lock = None
         try:
             if process is not None:
                 _end(process)
@@ -143,13 +209,14 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _silent(self, last: Attitude | None = None) -> AttitudeError:
+    def _silence(self, last: Attitude | None = None) -> AttitudeError:
+        """The error of a stream that is silent, after a last sample or from the beginning."""
         process = self._process
         if process is None:
             return AttitudeError(f"the IMU at {self.port} is closed")
         if process.poll() is not None and process.stderr is not None:
-            said = process.stderr.read().strip().splitlines()
-            return AttitudeError(f"the IMU at {self.port} cannot be read: {said[-1] if said else 'its reader ended'}")
+            lines = process.stderr.read().strip().splitlines() or ["its reader ended"]
+            return AttitudeError(f"the IMU at {self.port} cannot be read: {lines[-1]}")
         if last is None:
             return AttitudeError(
                 f"the IMU at {self.port} sends no attitude; it must stream its filter's Euler angles (set 0x82, field "
@@ -171,9 +238,3 @@ def _end(process: "subprocess.Popen[str]") -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def link_angle(sample: Attitude, axis: Axis, sign: int, offset_rad: float) -> float:
-    """Link angle [rad], from −π to π: sign · (Euler angle − offset), the offset being what the IMU shows at q = 0."""
-    angle = sign * (getattr(sample, axis) - offset_rad)
-    return math.remainder(angle, 2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""An emulator in a process of its own, as programs and tests use it."""
+"""Starts an emulator in a process of its own, for programs and tests."""
 
 import json
 import subprocess
@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.emulator.settings import EmulatorConfig
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.safety.child_process import child_command, child_environment
+from elastic_env.hardware.safety.processes import child_command, child_environment
 
-_LONGEST_SWING_S, _REST_RAD_S = 10.0, 0.02
-_LOOK_S, _STILL_LOOKS = 0.05, 3  # where a swing turns back it stands still for one look
+_LONGEST_SWING_S = 10.0
+_REST_RAD_S = 0.02
+_LOOK_S = 0.05
+_STILL_LOOKS = 3  # where a swing turns back it stands still for one look
 
 
 class RunningEmulator(AbstractContextManager["RunningEmulator"]):
@@ -28,27 +30,31 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     """
 
     def __init__(self, config: EmulatorConfig | None = None) -> None:
-        given = (config or EmulatorConfig()).model_dump_json()
+        text = (config or EmulatorConfig()).model_dump_json()
         self._process = subprocess.Popen(
-            child_command("elastic_env.hardware.emulator.process", given), env=child_environment(),
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
-        )  # fmt: skip
-        self._take_ports(self._hear())
+            child_command("elastic_env.hardware.emulator.process", text),
+            env=child_environment(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self._take_ports(self._receive())
 
     def faults(self, **changes: Any) -> None:
         """Switch faults on and off, see `Faults`; a bus that is plugged in again has another port."""
-        self._take_ports(self._ask({"faults": changes}))
+        self._take_ports(self._request({"faults": changes}))
 
     def events(self) -> list[tuple[float, int, str, int]]:
-        """What has been switched, commanded and asked for since the last call.
+        """Switches, goals and requests for states since the last call.
 
         Monotonic time, id, register, value [count]; `present_position` is what a state that was asked for is to tell.
         """
-        return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._ask({"events": True})]
+        return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._request({"events": True})]
 
     def state(self) -> dict[str, Any]:
         """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
-        return self._ask({"state": True})
+        return self._request({"state": True})
 
     def wait_until_rest(self) -> None:
         """Wait until joints that were let go have swung out: torque goes on at rest only.
@@ -56,14 +62,17 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         Raises:
             HardwareError: They still move after 10 s.
         """
-        deadline, before, still = time.monotonic() + _LONGEST_SWING_S, self.state(), 0
-        while still < _STILL_LOOKS:
+        deadline = time.monotonic() + _LONGEST_SWING_S
+        before = self.state()
+        still_looks = 0
+        while still_looks < _STILL_LOOKS:
             if time.monotonic() > deadline:
                 raise HardwareError(f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?")
             time.sleep(_LOOK_S)
             now = self.state()
             moved = np.abs(np.subtract(now["theta"], before["theta"])).max()
-            still = still + 1 if moved < _REST_RAD_S * (now["time_s"] - before["time_s"]) else 0
+            is_still = moved < _REST_RAD_S * (now["time_s"] - before["time_s"])
+            still_looks = still_looks + 1 if is_still else 0
             before = now
 
     def wait(self) -> None:
@@ -72,22 +81,21 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
 
     def close(self) -> None:
         """End it."""
-        if self._process.stdin is not None:
-            self._process.stdin.close()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
         self._process.wait(timeout=10)
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, request: dict[str, Any]) -> Any:
+    def _request(self, request: dict[str, Any]) -> Any:
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
-        return self._hear()
+        return self._receive()
 
-    def _hear(self) -> Any:
+    def _receive(self) -> Any:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -95,4 +103,5 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
         return json.loads(line)
 
     def _take_ports(self, ports: dict[str, str]) -> None:
-        self.port, self.imu_port = ports["port"], ports["imu_port"]
+        self.port = ports["port"]
+        self.imu_port = ports["imu_port"]

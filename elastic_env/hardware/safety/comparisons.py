@@ -10,7 +10,7 @@ from elastic_env.core.signals import BoolArray
 
 
 def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
-    """Where a value is not known to be at most a limit: it is greater, or one of the two is nan or infinite.
+    """True where a value is not known to be at most a limit: it is greater, or one of the two is nan or infinite.
 
     Args:
         value: (...), in the unit of the limit.
@@ -19,11 +19,11 @@ def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
     Returns:
         (...), of one value a single one.
     """
-    given, most = np.asarray(value, dtype=np.float64), np.asarray(limit, dtype=np.float64)
-    return ~(np.isfinite(given) & np.isfinite(most) & (given <= most))
+    values = np.asarray(value, dtype=np.float64)
+    most = np.asarray(limit, dtype=np.float64)
+    return ~(np.isfinite(values) & np.isfinite(most) & (values <= most))
 
 
 def is_outside(value: npt.ArrayLike, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
-    """Where a value is not known to lie between two bounds, or on one of them; shapes as in `exceeds`."""
-    least = np.asarray(lowest, dtype=np.float64)
-    return exceeds(value, highest) | exceeds(-np.asarray(value, dtype=np.float64), -least)
+    """True where a value is not known to lie between two bounds, or on one of them; shapes as in `exceeds`."""
+    return exceeds(value, highest) | exceeds(np.negative(value), np.negative(lowest))
