@@ -14,12 +14,11 @@ from rich.console import Console
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware import imu
-from elastic_env.hardware.emulator.settings import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, PlausibleAttitudes
 from elastic_env.hardware.safety import supervisor
-from elastic_env.hardware.safety.comparisons import exceeds, is_outside
-from elastic_env.hardware.safety.guard import Guard
+from elastic_env.hardware.safety.guard import Guard, exceeds, is_outside
 from elastic_env.hardware.safety.realtime import Pace
 from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
 from elastic_env.robots.testbed.model import Pendulum

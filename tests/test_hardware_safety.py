@@ -17,8 +17,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.port import Port
-from elastic_env.hardware.emulator.launch import RunningEmulator
-from elastic_env.hardware.emulator.settings import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
 from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import check_bus

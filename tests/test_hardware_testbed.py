@@ -23,8 +23,7 @@ import baselines
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.hardware.buses.bus import States
 from elastic_env.hardware.buses.servo_models import torque_of_current
-from elastic_env.hardware.emulator.launch import RunningEmulator
-from elastic_env.hardware.emulator.settings import EmulatorConfig
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import HardwareError, PortError
 from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, SharedSample
 from elastic_env.hardware.live import plant

@@ -1,4 +1,4 @@
-"""What can go wrong with hardware; every message names the port and says what to do."""
+"""Errors of hardware. Every message names the port and says what to do."""
 
 from elastic_env.core.errors import SystemFailedError
 

@@ -17,8 +17,8 @@ from typing import Literal
 
 from elastic_env.hardware.buses.port_lock import lock_port
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.safety.comparisons import is_outside
-from elastic_env.hardware.safety.processes import child_command, child_environment
+from elastic_env.hardware.safety.guard import is_outside
+from elastic_env.hardware.safety.processes import end_child, start_child
 
 Axis = Literal["roll", "pitch", "yaw"]
 
@@ -28,6 +28,7 @@ _COUNTER = struct.Struct("=q")
 _SAMPLE = struct.Struct("=dddd")
 _SIZE = _COUNTER.size + _SAMPLE.size
 _TRIES = 100
+_END_S = 2.0
 
 
 class AttitudeError(HardwareError):
@@ -166,14 +167,14 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         """Start the reader."""
         file = SharedSample.file()
         try:
-            self._process = subprocess.Popen(
-                child_command("elastic_env.hardware.imu_reader", str(file), port, str(baudrate)),
-                env=child_environment(),
+            self._process = start_child(
+                "elastic_env.hardware.imu_reader",
+                str(file),
+                port,
+                str(baudrate),
                 pass_fds=[file],
                 stdin=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,
             )
             return SharedSample(file)
         finally:
@@ -201,7 +202,7 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         self._lock = None
         try:
             if process is not None:
-                _end(process)
+                end_child(process, _END_S)
         finally:
             if lock is not None:
                 os.close(lock)
@@ -226,15 +227,3 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             f"the IMU at {self.port} has sent no attitude for {1e3 * (time.monotonic() - last.time_s):.0f} ms, "
             f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s); look at its cable and its data rate"
         )
-
-
-def _end(process: "subprocess.Popen[str]") -> None:
-    """End a reader: it stops when its input is closed."""
-    for pipe in (process.stdin, process.stderr):
-        if pipe is not None:
-            pipe.close()
-    try:
-        process.wait(timeout=2.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

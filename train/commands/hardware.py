@@ -123,7 +123,8 @@ class Emulate:
 
     def run(self) -> None:
         """Emulate."""
-        from elastic_env.hardware.emulator.settings import EmulatorConfig, Faults
+        from elastic_env.hardware.emulator.faults import Faults
+        from elastic_env.hardware.emulator.launch import EmulatorConfig
         from elastic_env.robots.testbed.environment import configure_testbed
         from train.hardware import emulate, require_switches
 

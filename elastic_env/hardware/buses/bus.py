@@ -32,9 +32,9 @@ class States:
     current: Array
     """Signed motor current [A]."""
     is_fresh: BoolArray
-    """Whether the servo answered this very request, whole and intact."""
+    """True where the servo answered this very request, whole and intact."""
     has_alert: BoolArray
-    """Whether it reports a hardware error."""
+    """True where it reports a hardware error."""
     time_s: float
     """When the replies were in, on the monotonic clock."""
     temperature: Array = field(default_factory=lambda: np.array(np.nan))
@@ -75,7 +75,6 @@ class Bus(Protocol):
 
     def write_goals(self, angles: Array) -> None:
         """Command all servos at once, (n,) [rad]; nobody confirms."""
-        ...
 
     def read_states(self, timeout_s: float) -> States:
         """States of all servos; waits for all replies together for at most a time [s]."""
@@ -83,7 +82,6 @@ class Bus(Protocol):
 
     def write_goal(self, servo_id: int, angle: float) -> None:
         """Command one servo [rad]."""
-        ...
 
     def read_position(self, servo_id: int) -> float:
         """Present position [rad]."""
@@ -107,15 +105,12 @@ class Bus(Protocol):
 
     def write_torque(self, servo_id: int, is_on: bool) -> None:
         """Switch the torque of one servo."""
-        ...
 
     def write_watchdog(self, servo_id: int, is_on: bool) -> None:
         """Set or clear the bus watchdog of a servo that has one."""
-        ...
 
     def torque_off(self) -> None:
         """Switch all torque off at once, also after a read that was interrupted; nobody confirms."""
-        ...
 
     def confirm_torque_off(self) -> list[str]:
         """Names of the servos that do not say that their torque is off, after some tries each."""

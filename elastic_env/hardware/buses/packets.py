@@ -130,7 +130,7 @@ class Packet:
     instruction: int
     parameters: bytes
     is_intact: bool = True
-    """Whether the checksum fits; of a packet that is not intact only the id is of use."""
+    """True if the checksum fits; of a packet that is not intact only the id is of use."""
 
 
 class Parser:

@@ -111,7 +111,7 @@ class ServoModel:
 
     @property
     def has_watchdog(self) -> bool:
-        """Whether the servo stops by itself when the bus falls silent."""
+        """True if the servo stops by itself when the bus falls silent."""
         return "bus_watchdog" in self.table
 
     @functools.cached_property
@@ -130,7 +130,7 @@ class ServoModel:
         return tuple(by_length[length] for length in sorted(by_length)[:NUM_BLOCKS])
 
     def has_temperature(self, block: range) -> bool:
-        """Whether a block holds the temperature too."""
+        """True if a block holds the temperature too."""
         register = self.table[_TEMPERATURE]
         return block.start <= register.address and register.end <= block.stop
 

@@ -11,8 +11,8 @@ from collections import deque
 
 import numpy as np
 
-from elastic_env.hardware.emulator.settings import EmulatorConfig, Faults
-from elastic_env.hardware.emulator.terminal import flip_bit
+from elastic_env.hardware.emulator.faults import Faults, flip_bit
+from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.runtime.sensors import attitude
 
 Angles = tuple[float, float, float]

@@ -1,21 +1,55 @@
-"""Starts an emulator in a process of its own, for programs and tests."""
+"""An emulator in a process of its own, as programs and tests start it."""
 
 import json
 import subprocess
+import termios
 import time
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from pydantic import model_validator
 
-from elastic_env.hardware.emulator.settings import EmulatorConfig
+from elastic_env.core.config import Model, quantity
+from elastic_env.hardware.buses.packets import HIGHEST_RATE, LOWEST_RATE, RATES, require_ids
+from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.faults import Faults
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.safety.processes import child_command, child_environment
+from elastic_env.hardware.safety.processes import end_child, start_child
+from elastic_env.robots.testbed.config import TestbedConfig
 
+_END_S = 10.0
 _LONGEST_SWING_S = 10.0
 _REST_RAD_S = 0.02
 _LOOK_S = 0.05
 _STILL_LOOKS = 3  # where a swing turns back it stands still for one look
+
+
+class EmulatorConfig(Model):
+    """An emulated bus with its servos, and the IMU on the link of the first."""
+
+    model_number: int = 54024
+    """Type of the servos."""
+    claimed_model_number: int | None = None
+    """Model number that they report, if it is to be a wrong one."""
+    ids: tuple[int, ...] = (1,)
+    """Their ids."""
+    testbed: TestbedConfig = TestbedConfig()
+    """The joints behind them, and through its scenario the quality of the IMU."""
+    imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000, description="packets of the IMU per second")
+    baudrate: int = quantity(
+        "bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE, description="rate of the bus; no other is heard"
+    )
+    faults: Faults = Faults()
+    seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
+
+    @model_validator(mode="after")
+    def _servos_exist(self) -> Self:
+        servo_model(self.model_number)
+        if not hasattr(termios, f"B{self.baudrate}"):
+            raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}")
+        require_ids(self.ids)
+        return self
 
 
 class RunningEmulator(AbstractContextManager["RunningEmulator"]):
@@ -31,13 +65,8 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
 
     def __init__(self, config: EmulatorConfig | None = None) -> None:
         text = (config or EmulatorConfig()).model_dump_json()
-        self._process = subprocess.Popen(
-            child_command("elastic_env.hardware.emulator.process", text),
-            env=child_environment(),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
+        self._process = start_child(
+            "elastic_env.hardware.emulator.process", text, stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         self._take_ports(self._receive())
 
@@ -81,10 +110,7 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
 
     def close(self) -> None:
         """End it."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
-        self._process.wait(timeout=10)
+        end_child(self._process, _END_S)
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,11 +1,17 @@
 """The emulator's own process: pseudo-terminals in real time, and a line-based channel for faults and events."""
 
+import contextlib
+import fcntl
 import json
 import math
 import os
+import pty
 import select
+import struct
 import sys
+import termios
 import time
+import tty
 from collections import deque
 from functools import partial
 from typing import Any
@@ -14,11 +20,11 @@ import numpy as np
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.faults import damage
 from elastic_env.hardware.emulator.imu import EmulatedImu
 from elastic_env.hardware.emulator.joints import Joints
+from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
-from elastic_env.hardware.emulator.settings import EmulatorConfig
-from elastic_env.hardware.emulator.terminal import Terminal, damage
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 
 _PHYSICS_S = 2e-3  # between two advances, as a rule
@@ -28,6 +34,41 @@ _PACKET_S = 1e-3  # or what it has after that time
 _SETTLE_S = 3e-4  # after a write, for the kernel to pass it on, which it does at a lower priority than ours
 _WAIT_S = 0.1
 _KEPT_EVENTS = 100_000
+_UNREAD_BYTES = 2000
+_OUTPUT_SPEED = 5  # in what tcgetattr returns
+
+
+class Terminal:
+    """A pseudo-terminal that passes bytes through as they are; programs open its name as they would a serial port."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        self.name = os.ttyname(self._slave)
+
+    def write(self, data: bytes) -> None:
+        """Pass bytes on; they are lost where nobody has read what is there, as on a line to nobody."""
+        unread = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, b"\0\0\0\0"))[0]
+        if unread > _UNREAD_BYTES:
+            termios.tcflush(self._slave, termios.TCIFLUSH)
+        with contextlib.suppress(OSError):
+            os.write(self.master, data)
+
+    def read(self) -> bytes:
+        """Bytes that have come."""
+        with contextlib.suppress(OSError):
+            return os.read(self.master, 4096)
+        return b""
+
+    def has_rate(self, baudrate: int) -> bool:
+        """True if the program at the other end has set a baud rate; one that the system has no name for passes."""
+        return termios.tcgetattr(self._slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}")
+
+    def close(self) -> None:
+        """Take it away, as an unplugged adapter is."""
+        os.close(self.master)
+        os.close(self._slave)
 
 
 class Emulator:

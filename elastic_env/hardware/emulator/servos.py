@@ -83,7 +83,7 @@ class EmulatedServo:
 
     @property
     def is_on(self) -> bool:
-        """Whether torque is on."""
+        """True if torque is on."""
         return bool(self["torque_enable"])
 
     @property

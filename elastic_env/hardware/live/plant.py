@@ -14,7 +14,7 @@ from elastic_env.core.signals import Array, BoolArray
 from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.errors import HardwareError
 from elastic_env.hardware.imu import AttitudeStream
-from elastic_env.hardware.safety.comparisons import exceeds
+from elastic_env.hardware.safety.guard import exceeds
 from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
 from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
 from elastic_env.hardware.settings import HardwareSettings

@@ -32,13 +32,13 @@ class Check:
     what: str
     value: str
     cure: str = ""
-    """What to do about it; empty where nothing is wrong."""
+    """Cure; empty where nothing is wrong."""
     is_vital: bool = True
-    """Whether nothing may move before that is done."""
+    """True if nothing may move before that is done."""
 
     @property
     def is_good(self) -> bool:
-        """Whether nothing is to be done."""
+        """True if nothing is to be done."""
         return not self.cure
 
 
@@ -93,43 +93,40 @@ def _check_servo(bus: DynamixelBus, servo_id: int, model: ServoModel) -> list[Ch
     read = partial(bus.read, servo_id)
     error = explain_errors(read("hardware_error_status"))
     volts = read("present_input_voltage") / 10.0
-    lowest_volts = read("min_voltage_limit") / 10.0
-    highest_volts = read("max_voltage_limit") / 10.0
+    low = read("min_voltage_limit") / 10.0
+    high = read("max_voltage_limit") / 10.0
     degrees = read("present_temperature")
     hottest = read("temperature_limit")
     mode = read("operating_mode")
     delay_us = _DELAY_UNIT_US * read("return_delay_time")
     level = read("status_return_level")
     amperes = read(model.current_limit) * model.current_unit
-    needed_amperes = current_of_torque(LARGEST_TORQUE_NM)
-    position = bus.read_position(servo_id)
+    strongest = current_of_torque(LARGEST_TORQUE_NM)
+    counts = round(strongest / model.current_unit)
     lowest = read("min_position_limit") * model.position_unit
     highest = read("max_position_limit") * model.position_unit
     is_on = bool(read("torque_enable"))
 
-    power = "remove the cause, then switch the power off and on"
-    supply = f"it must be {lowest_volts:g} to {highest_volts:g} V"
-    current = (
-        f"with torque off, write {round(needed_amperes / model.current_unit)} to {model.current_limit}: more than "
-        f"{LARGEST_TORQUE_NM:g} N·m hurts the gear"
-    )
-    position_mode = f"with torque off, write {_POSITION_MODE}, position, to operating_mode"
-    no_delay = "with torque off, write 0 to return_delay_time"
-    full_replies = f"write {_FULL_REPLIES} to status_return_level"
+    restart = "remove the cause, then switch the power off and on"
+    supply = f"it must be {low:g} to {high:g} V"
+    cool = f"let it cool; limit {hottest} °C"
+    mend_mode = f"with torque off, write {_POSITION_MODE}, position, to operating_mode"
+    mend_delay = "with torque off, write 0 to return_delay_time"
+    mend_level = f"write {_FULL_REPLIES} to status_return_level"
+    hurts = f"more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"
+    mend_limit = f"with torque off, write {counts} to {model.current_limit}: {hurts}"
     left_on = "a program left it on; it is switched off before anything begins"
-    is_weak = amperes <= needed_amperes + 0.1
-    is_cool = degrees < _WARM_SHARE * hottest
     watchdog = "yes" if model.has_watchdog else "not in this firmware; the supervisor stands in"
     return [
         Check("model, firmware", f"{model.number} {model.name}, version {read('firmware_version')}"),
-        Check("hardware error", error or "none", _unless(not error, power)),
-        Check("input voltage", f"{volts:.1f} V", _unless(lowest_volts < volts < highest_volts, supply)),
-        Check("temperature", f"{degrees} °C", _unless(is_cool, f"let it cool; limit {hottest} °C")),
-        Check("operating mode", str(mode), _unless(mode == _POSITION_MODE, position_mode)),
-        Check("return delay", f"{delay_us} µs", _unless(delay_us <= _LONGEST_DELAY_US, no_delay)),
-        Check("status return level", str(level), _unless(level == _FULL_REPLIES, full_replies)),
-        Check("current limit", f"{amperes:.1f} A", _unless(is_weak, current), is_vital=False),
-        Check("position", f"{position:+.4f} rad"),
+        Check("hardware error", error or "none", _unless(not error, restart)),
+        Check("input voltage", f"{volts:.1f} V", _unless(low < volts < high, supply)),
+        Check("temperature", f"{degrees} °C", _unless(degrees < _WARM_SHARE * hottest, cool)),
+        Check("operating mode", str(mode), _unless(mode == _POSITION_MODE, mend_mode)),
+        Check("return delay", f"{delay_us} µs", _unless(delay_us <= _LONGEST_DELAY_US, mend_delay)),
+        Check("status return level", str(level), _unless(level == _FULL_REPLIES, mend_level)),
+        Check("current limit", f"{amperes:.1f} A", _unless(amperes <= strongest + 0.1, mend_limit), is_vital=False),
+        Check("position", f"{bus.read_position(servo_id):+.4f} rad"),
         Check("position limits", f"{lowest:.2f} to {highest:.2f} rad"),
         Check("torque", "on" if is_on else "off", _unless(not is_on, left_on), is_vital=False),
         Check("bus watchdog", watchdog),

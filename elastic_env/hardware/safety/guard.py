@@ -1,4 +1,8 @@
-"""The last layer before the wire: keeps commands within their limits, and stops a motion that leaves them."""
+"""The last layer before the wire: keeps commands within their limits, and stops a motion that leaves them.
+
+Whatever is not a finite number is beyond every bound. `nan > limit` is False, so that a plain comparison would let a
+motion go on whose measurement is none.
+"""
 
 from collections.abc import Sequence
 
@@ -9,11 +13,30 @@ from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States
 from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.errors import FaultError
-from elastic_env.hardware.safety.comparisons import exceeds, is_outside
 from elastic_env.hardware.settings import SafetyLimits
 
 _LONGEST_WITHOUT_TEMPERATURE = 2 * TEMPERATURE_CYCLES + 10
 """Cycles without a servo's temperature that stop the motion; replies that are missing for longer do so before."""
+
+
+def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
+    """True where a value is not known to be at most a limit: it is greater, or one of the two is nan or infinite.
+
+    Args:
+        value: (...), in the unit of the limit.
+        limit: (...), likewise.
+
+    Returns:
+        (...), of one value a single one.
+    """
+    values = np.asarray(value, dtype=np.float64)
+    most = np.asarray(limit, dtype=np.float64)
+    return ~(np.isfinite(values) & np.isfinite(most) & (values <= most))
+
+
+def is_outside(value: npt.ArrayLike, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
+    """True where a value is not known to lie between two bounds, or on one of them; shapes as in `exceeds`."""
+    return exceeds(value, highest) | exceeds(np.negative(value), np.negative(lowest))
 
 
 class Guard:
@@ -53,7 +76,7 @@ class Guard:
 
     @property
     def is_holding(self) -> bool:
-        """Whether a reply was missing in the last cycle: the last command is then repeated, whatever is asked for."""
+        """True if a reply was missing in the last cycle: the last command is then repeated, whatever is asked for."""
         return bool(self._without_reply.any())
 
     def command(self, goals: Array, elapsed_s: float) -> tuple[Array, BoolArray]:

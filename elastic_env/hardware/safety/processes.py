@@ -19,6 +19,7 @@ import runpy
 import select
 import signal
 import socket
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -46,6 +47,30 @@ def child_command(module: str, *arguments: str) -> list[str]:
     return [sys.executable, "-P", str(Path(__file__).resolve()), folders, module, *arguments]
 
 
+def start_child(module: str, *arguments: str, **options: Any) -> "subprocess.Popen[str]":
+    """Run a module of ours in a process and a session of its own.
+
+    Args:
+        module: As in `child_command`.
+        *arguments: Likewise.
+        **options: Further arguments of `subprocess.Popen`: its pipes and descriptors.
+    """
+    command = child_command(module, *arguments)
+    return subprocess.Popen(command, env=child_environment(), text=True, start_new_session=True, **options)
+
+
+def end_child(process: "subprocess.Popen[str]", within_s: float) -> None:
+    """End a child that stops when its input is closed; one that does not within a time [s] is killed."""
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            pipe.close()
+    try:
+        process.wait(timeout=within_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
 def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
     """The environment of a child: that of this program, its PYTHONPATH without the working directory.
 
@@ -58,7 +83,7 @@ def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, 
 
 
 def _is_here(entry: str) -> bool:
-    """Whether an entry of PYTHONPATH is the working directory, which an empty one means too."""
+    """True if an entry of PYTHONPATH is the working directory, which an empty one means too."""
     return not entry or os.path.realpath(entry) == os.path.realpath(".")
 
 
@@ -113,7 +138,7 @@ class Channel:
         self._end.send(json.dumps(message).encode())
 
     def is_waiting(self, timeout_s: float | None) -> bool:
-        """Whether a message, or the end of the other side, comes within a time."""
+        """True if a message, or the end of the other side, comes within a time."""
         return bool(select.select([self._end], [], [], timeout_s)[0])
 
     def receive(self) -> dict[str, Any] | None:
@@ -130,7 +155,7 @@ class Channel:
 
 
 def is_ending(process_id: int, proc: Path = _PROC) -> bool:
-    """Whether a process has been killed, ends, writes its core, or is gone; False where the system does not tell.
+    """True if a process has been killed, ends, writes its core, or is gone; False where the system does not tell.
 
     A program that is killed closes its end of a channel late. It first needs a processor to end on, and gives its
     memory back before its files. On a busy computer that takes as long as a hang does. Linux tells of it at once.

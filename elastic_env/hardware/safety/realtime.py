@@ -6,7 +6,7 @@ import os
 import time
 from enum import IntEnum
 
-from elastic_env.hardware.safety.comparisons import exceeds
+from elastic_env.hardware.safety.guard import exceeds
 
 LONGEST_WAIT_S = 0.02
 """How far ahead a control cycle may ask to be read [s]."""
@@ -105,5 +105,5 @@ class Pace:
         return self._lost_s + late_s
 
     def is_overrun(self, late_s: float) -> bool:
-        """Whether a period was lost that was so late."""
+        """True if a period that was so late counts as lost."""
         return bool(exceeds(late_s, 0.5 * self._period_s))

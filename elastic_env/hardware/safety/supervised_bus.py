@@ -16,7 +16,7 @@ from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
-from elastic_env.hardware.safety.processes import Channel, child_command, child_environment
+from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
 
@@ -43,9 +43,9 @@ class Cycle:
     goals: Array
     """Commanded positions, (n,) [rad]."""
     is_limited: BoolArray
-    """Where that is not what was asked for, (n,)."""
+    """True where that is not what was asked for, (n,)."""
     is_held: bool
-    """Whether the last command was repeated because a reply was missing."""
+    """True if the last command was repeated because a reply was missing."""
     late_s: float
     """How much later than asked for the servos were read [s]."""
 
@@ -86,14 +86,12 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         own, other = Channel.pair()
         self._channel = Channel(own)
         with other:
-            command = child_command(
-                "elastic_env.hardware.safety.supervisor", str(other.fileno()), str(baudrate), *ports
-            )
-            self._process = subprocess.Popen(
-                command,
-                env=child_environment(),
+            self._process = start_child(
+                "elastic_env.hardware.safety.supervisor",
+                str(other.fileno()),
+                str(baudrate),
+                *ports,
                 pass_fds=[other.fileno()],
-                start_new_session=True,
                 stdin=subprocess.DEVNULL,
             )
         try:

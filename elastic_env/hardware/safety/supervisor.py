@@ -23,8 +23,7 @@ from elastic_env.hardware.buses.bus import Bus, BusGroup, States, servo_name
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.safety.checks import check_bus
-from elastic_env.hardware.safety.comparisons import exceeds
-from elastic_env.hardware.safety.guard import Guard, explain_heat
+from elastic_env.hardware.safety.guard import Guard, exceeds, explain_heat
 from elastic_env.hardware.safety.processes import Channel, is_ending
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, Priority, prefer_realtime, sleep_until
 from elastic_env.hardware.settings import SafetyLimits
