@@ -39,28 +39,40 @@ PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
 
 
 class Mounting(HardwareSettings):
-    """The file of `--mounting`: wiring and mounting of the testbed, and the pendulum that hangs there."""
+    """The file of `--mounting`: wiring and mounting of the testbed, and its pendulum."""
 
     pendulum: Pendulum = Pendulum()
 
 
 def hardware_arguments(
-    port: str | None, imu_port: str | None, settings: Path | None, *, yes: bool, patient: bool = False
+    port: str | None,
+    imu_port: str | None,
+    settings: Path | None,
+    *,
+    yes: bool,
+    patient: bool = False,
 ) -> dict[str, Any]:
-    """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command; empty without hardware.
+    """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command.
+
+    Empty without hardware.
 
     Args:
         port: Port of the servo, or None for that of the settings.
         imu_port: Port of the IMU, likewise.
         settings: YAML file of a `Mounting`, or None.
         yes: Whether nobody need agree before the first motion.
-        patient: Whether a motion goes on for as long as it can where replies, commands or attitudes are missing.
+        patient: Whether a motion goes on for as long as it can where replies, commands or attitudes
+            are missing.
 
     Raises:
         ConfigurationError: There are options of hardware, but no port.
     """
     if port is None and settings is None:
-        for option, is_given in {"--imu-port": imu_port is not None, "--yes": yes, "--patient": patient}.items():
+        for option, is_given in {
+            "--imu-port": imu_port is not None,
+            "--yes": yes,
+            "--patient": patient,
+        }.items():
             if is_given:
                 raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
         return {}
@@ -91,7 +103,13 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
             for servo in bus.scan():
                 model = servo_models().get(servo.model_number)
                 name = model.name if model is not None else "not known here"
-                table.add_row(str(rate), str(servo.servo_id), str(servo.model_number), name, str(servo.firmware))
+                table.add_row(
+                    str(rate),
+                    str(servo.servo_id),
+                    str(servo.model_number),
+                    name,
+                    str(servo.firmware),
+                )
     if table.row_count:
         console.print(table)
     else:
@@ -102,7 +120,14 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
     return table.row_count
 
 
-def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, imu_baudrate: int, console: Console) -> bool:
+def check(
+    port: str,
+    ids: list[int],
+    baudrate: int,
+    imu_port: str | None,
+    imu_baudrate: int,
+    console: Console,
+) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
     HardwareSettings(port=port, baudrate=baudrate, imu_port=imu_port, imu_baudrate=imu_baudrate)  # checks them
     require_ids(ids)
@@ -128,7 +153,7 @@ def run(
     console: Console,
     output: Path | None = None,
 ) -> Path:
-    """Play one episode on hardware, show it as it goes, and keep every step in log.csv, also of one that is cut short.
+    """Play one episode, show it as it goes, and keep every step in log.csv, also if cut short.
 
     Args:
         arguments: Of the environment.
@@ -143,7 +168,11 @@ def run(
     env: Any = gymnasium.make(environment("hardware").id, disable_env_checker=True, reference=reference, **arguments)
     with contextlib.closing(env):
         player = make_policy(policy, env)
-        configuration = {"policy": policy.model_dump(mode="json"), "reference": reference, **arguments}
+        configuration = {
+            "policy": policy.model_dump(mode="json"),
+            "reference": reference,
+            **arguments,
+        }
         with run_folder("hardware", configuration, None, output) as folder:
             metrics: dict[str, Any] = {}
             with _open_log(folder / "log.csv", console) as log:
@@ -168,7 +197,10 @@ def _play(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
 
 
 class _Log:
-    """The rows of log.csv, and a line on the console once a second, up to which all rows are on the disk."""
+    """The rows of log.csv, and a line on the console once a second.
+
+    Then all rows are on the disk.
+    """
 
     _SHOWN = (
         ("t", "s", "time_s", 1.0, "7.1f"),
@@ -232,7 +264,10 @@ def require_switches(names: Sequence[str]) -> None:
 
 
 def emulate(
-    config: EmulatorConfig, console: Console, later: Mapping[str, bool] | None = None, after_s: float = 0.0
+    config: EmulatorConfig,
+    console: Console,
+    later: Mapping[str, bool] | None = None,
+    after_s: float = 0.0,
 ) -> None:
     """Emulate until Ctrl-C.
 
@@ -252,7 +287,8 @@ def emulate(
         console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
         console.print(
             f"for example: elastic hardware check {emulator.port}, or\n"
-            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
+            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes "
+            "--patient\nCtrl-C ends it.",
             soft_wrap=True,
         )
         if later:

@@ -3,5 +3,6 @@
     env → supervised bus ──socket──→ supervisor (limits, torque off) → bus → dynamixel-sdk → port
     env → attitude stream ──pipe──→ IMU reader → pymscl → port
 
-Only the supervisor touches the servos' port; it outlives the program and switches torque off when that dies or hangs.
+Only the supervisor touches the servos' port; it outlives the program and switches torque off when
+that dies or hangs.
 """

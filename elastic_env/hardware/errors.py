@@ -16,7 +16,10 @@ class ReplyError(HardwareError):
 
 
 class BusGoneError(HardwareError):
-    """The port is gone: unplugged, or its driver failed. Nothing can be commanded any more, torque off neither."""
+    """The port is gone: unplugged, or its driver failed.
+
+    Nothing can be commanded any more, torque off neither.
+    """
 
 
 class FaultError(HardwareError):

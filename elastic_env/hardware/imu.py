@@ -1,8 +1,10 @@
-"""The link's attitude from a MicroStrain IMU, read by a process of its own; a stream that stalls is an error.
+"""The link's attitude from a MicroStrain IMU, read by a process of its own.
 
-The maker's library keeps Python's lock while it waits, which would hold the control loop up, hence the process. The
-newest sample lies in shared memory with its time. A counter around each write, odd while it lasts, keeps halves of two
-samples apart.
+A stream that stalls is an error.
+
+The maker's library keeps Python's lock while it waits, which would hold the control loop up, hence
+the process. The newest sample lies in shared memory with its time. A counter around each write, odd
+while it lasts, keeps halves of two samples apart.
 """
 
 import math
@@ -32,12 +34,12 @@ _END_S = 2.0
 
 
 class AttitudeError(HardwareError):
-    """The IMU cannot be opened, sends nothing or what it cannot have measured, or has stopped sending."""
+    """The IMU cannot be opened, is silent, or sends angles that it cannot have measured."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """One sample: Euler angles of the maker's north-east-down convention [rad], and when it came in [s, monotonic]."""
+    """One sample: Euler angles [rad], north-east-down, and when it came in [s, monotonic]."""
 
     time_s: float
     roll: float
@@ -45,17 +47,21 @@ class Attitude:
     yaw: float
 
     def link_angle(self, axis: Axis, sign: int, offset_rad: float) -> float:
-        """Link angle [rad], from −π to π: sign · (Euler angle − offset), the offset being that of the IMU at q = 0."""
+        """Link angle sign · (Euler angle − offset) [rad], from −π to π.
+
+        The offset is that at q = 0.
+        """
         return math.remainder(sign * (getattr(self, axis) - offset_rad), 2.0 * math.pi)
 
 
 class PlausibleAttitudes:
-    """Looks at the attitudes that come, one after the other, for those that cannot have been measured.
+    """Looks at attitudes, one after the other, for those that cannot have been measured.
 
-    An IMU marks as valid what its filter has computed, right or not. A filter that stands still goes on sending its
-    last angles. Those of a working one should not be equal in all bits: a gyroscope of some 0.005 °/s/√Hz turns an
-    angle by about 10 µrad from packet to packet at 100 Hz, and a bit is at most 0.24 µrad. So three angles that stay
-    the same are no newer than when they first came, and have the age at which any attitude counts as missing.
+    An IMU marks as valid what its filter has computed, right or not. A filter that stands still
+    goes on sending its last angles. Those of a working one should not be equal in all bits: a
+    gyroscope of some 0.005 °/s/√Hz turns an angle by about 10 µrad from packet to packet at 100 Hz,
+    and a bit is at most 0.24 µrad. So three angles that stay the same are no newer than when they
+    first came, and have the age at which any attitude counts as missing.
 
     Args:
         oldest_s: Age at which an attitude counts as missing [s].
@@ -76,16 +82,18 @@ class PlausibleAttitudes:
             angle = getattr(sample, name)
             if is_outside(angle, -end - _ROUNDING_RAD, end + _ROUNDING_RAD):
                 return (
-                    f"sends {name} = {angle:g} rad and calls it valid; it must lie between {-end:.4f} and {end:.4f} "
-                    "rad: switch the IMU off and on, and look at the settings of its filter"
+                    f"sends {name} = {angle:g} rad and calls it valid; it must lie between "
+                    f"{-end:.4f} and {end:.4f} rad: switch the IMU off and on, and look at the "
+                    "settings of its filter"
                 )
         if self._first is None or astuple(sample)[1:] != astuple(self._first)[1:]:
             self._first = sample
         same_s = sample.time_s - self._first.time_s
         if is_outside(same_s, 0.0, self._oldest_s):
             return (
-                f"has sent the same attitude in all bits for {1e3 * same_s:.0f} ms, {1e3 * self._oldest_s:.0f} ms are "
-                "allowed (imu_oldest_s): its filter stands still; switch the IMU off and on"
+                f"has sent the same attitude in all bits for {1e3 * same_s:.0f} ms, "
+                f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s): its filter stands "
+                "still; switch the IMU off and on"
             )
         return ""
 
@@ -118,7 +126,8 @@ class SharedSample:
     def get(self) -> Attitude | None:
         """The newest sample; None before the first.
 
-        Where a write does not come to its end, because its process died or waits, it is the one before.
+        Where a write does not come to its end, because its process died or waits, it is the one
+        before.
         """
         for _ in range(_TRIES):
             before = self._counter()
@@ -139,7 +148,8 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         port: Device, such as /dev/ttyACM0.
         baudrate: Bits per second.
         oldest_s: Age at which a sample counts as missing [s].
-        wait_s: How long to wait for the first one, with the start of the reader on a busy computer [s].
+        wait_s: How long to wait for the first one, with the start of the reader on a busy computer
+            [s].
 
     Raises:
         PortError: There is no such port, it may not be opened, or another program has it.
@@ -184,7 +194,8 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
         """The newest sample.
 
         Raises:
-            AttitudeError: It is too old: the stream has stopped. Or no IMU that works can have measured it.
+            AttitudeError: It is too old: the stream has stopped. Or no IMU that works can have
+                measured it.
         """
         sample = self._shared.get()
         if sample is None or is_outside(time.monotonic() - sample.time_s, 0.0, self._oldest_s):
@@ -220,10 +231,11 @@ class AttitudeStream(AbstractContextManager["AttitudeStream"]):
             return AttitudeError(f"the IMU at {self.port} cannot be read: {lines[-1]}")
         if last is None:
             return AttitudeError(
-                f"the IMU at {self.port} sends no attitude; it must stream its filter's Euler angles (set 0x82, field "
-                "0x05) at 100 Hz or more, at this baud rate"
+                f"the IMU at {self.port} sends no attitude; it must stream its filter's Euler "
+                "angles (set 0x82, field 0x05) at 100 Hz or more, at this baud rate"
             )
         return AttitudeError(
-            f"the IMU at {self.port} has sent no attitude for {1e3 * (time.monotonic() - last.time_s):.0f} ms, "
-            f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s); look at its cable and its data rate"
+            f"the IMU at {self.port} has sent no attitude for "
+            f"{1e3 * (time.monotonic() - last.time_s):.0f} ms, {1e3 * self._oldest_s:.0f} ms are "
+            "allowed (imu_oldest_s); look at its cable and its data rate"
         )

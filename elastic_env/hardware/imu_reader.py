@@ -18,7 +18,8 @@ _STALE_AT_FIRST_S = 0.1
 def read(shared: SharedSample, port: str, baudrate: int) -> None:
     """Put every valid attitude into shared memory until the input is closed.
 
-    What lay in the port's buffer before has no known age and is passed over. Damaged packets the library drops itself.
+    What lay in the port's buffer before has no known age and is passed over. Damaged packets the
+    library drops itself.
     """
     try:
         import mscl

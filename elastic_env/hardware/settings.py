@@ -1,4 +1,4 @@
-"""Settings of a real testbed with their units and bounds: safety limits, ports, wiring, mounting."""
+"""Settings of a real testbed with units and bounds: safety limits, ports, wiring, mounting."""
 
 import math
 import os
@@ -21,7 +21,10 @@ def _within(unit: str, default: float, least: float, most: float, description: s
 
 
 class SafetyLimits(Model):
-    """Limits of commands, and of measurements that stop the motion; angles as the servo has them."""
+    """Limits of commands, and of measurements that stop the motion.
+
+    Angles as the servo has them.
+    """
 
     lowest_rad: float = _within("rad", -1.6, -_TURN, _TURN, "lowest goal")
     highest_rad: float = _within("rad", 1.6, -_TURN, _TURN, "highest goal")
@@ -40,14 +43,17 @@ class SafetyLimits(Model):
     def _range_is_ordered(self) -> Self:
         if self.highest_rad - self.lowest_rad < _LEAST_RANGE_RAD:
             raise ValueError(
-                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got {self.lowest_rad} and "
-                f"{self.highest_rad}"
+                f"lowest_rad must be below highest_rad, by at least {_LEAST_RANGE_RAD} rad, got "
+                f"{self.lowest_rad} and {self.highest_rad}"
             )
         return self
 
 
 class HardwareSettings(Model):
-    """Ports, wiring and mounting of a real testbed; the angles of its limits are those of the joint."""
+    """Ports, wiring and mounting of a real testbed.
+
+    The angles of its limits are those of the joint.
+    """
 
     port: str
     """Port of the servo, such as /dev/ttyUSB0, or of an emulator; on the command line --port."""
@@ -82,8 +88,9 @@ class HardwareSettings(Model):
         low, high = self._servo_range()
         if low < -_TURN or high > _TURN:
             raise ValueError(
-                f"lowest_rad {self.limits.lowest_rad:g} and highest_rad {self.limits.highest_rad:g} with zero_rad "
-                f"{self.zero_rad:g} are {low:.2f} to {high:.2f} rad of the servo, which has ±{_TURN:.2f}"
+                f"lowest_rad {self.limits.lowest_rad:g} and highest_rad "
+                f"{self.limits.highest_rad:g} with zero_rad {self.zero_rad:g} are {low:.2f} to "
+                f"{high:.2f} rad of the servo, which has ±{_TURN:.2f}"
             )
         return self
 

@@ -1,4 +1,4 @@
-"""Servos of any make in SI units: their states, one bus, and several buses that work at the same time."""
+"""Servos of any make in SI units: states, one bus, several buses that work at the same time."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -38,7 +38,10 @@ class States:
     time_s: float
     """When the replies were in, on the monotonic clock."""
     temperature: Array = field(default_factory=lambda: np.array(np.nan))
-    """[°C]; nan where this request was not for it, which nobody may take for cool. One nan stands for all servos."""
+    """[°C]; nan where this request was not for it, which nobody may take for cool.
+
+    One nan stands for all servos.
+    """
 
     def dump(self) -> dict[str, Any]:
         """The same as lists, for a message."""
@@ -60,8 +63,8 @@ class States:
 class Bus(Protocol):
     """A port with its attached servos, as the supervisor needs it.
 
-    Every method raises `BusGoneError` where the port is gone. Those with an id wait for the servo's confirmation
-    and raise `ReplyError` where it does not come, or the servo refuses.
+    Every method raises `BusGoneError` where the port is gone. Those with an id wait for the servo's
+    confirmation and raise `ReplyError` where it does not come, or the servo refuses.
     """
 
     name: str
@@ -110,7 +113,10 @@ class Bus(Protocol):
         """Set or clear the bus watchdog of a servo that has one."""
 
     def torque_off(self) -> None:
-        """Switch all torque off at once, also after a read that was interrupted; nobody confirms."""
+        """Switch all torque off at once, also after a read that was interrupted.
+
+        Nobody confirms.
+        """
 
     def confirm_torque_off(self) -> list[str]:
         """Names of the servos that do not say that their torque is off, after some tries each."""
@@ -151,13 +157,16 @@ class BusGroup:
         return States.join(self._call_all([partial(bus.read_states, timeout_s) for bus in self.buses]))
 
     def torque_off(self, when_sent: Callable[[], None] = lambda: None) -> HardwareError | None:
-        """Switch all torque off, at every bus before any servo is asked whether it is. A lost bus keeps no other on.
+        """Switch all torque off, at every bus before any servo is asked whether it is.
+
+        A lost bus keeps no other on.
 
         Args:
             when_sent: Called in between; servos that do not answer make the rest last.
 
         Returns:
-            What is not certain: a `BusGoneError` where a bus is gone, else a `ReplyError`; None if all is off.
+            What is not certain: a `BusGoneError` where a bus is gone, else a `ReplyError`; None if
+            all is off.
         """
         self._call_all([partial(_call, bus.torque_off) for bus in self.buses])
         when_sent()
@@ -176,7 +185,10 @@ class BusGroup:
         return kind("; ".join(problems))
 
     def _call_all(self, calls: Sequence[Callable[[], T]]) -> list[T]:
-        """Call one function for each bus, the first in this thread; all of them are done when an error is raised."""
+        """Call one function for each bus, the first in this thread.
+
+        All of them are done when an error is raised.
+        """
         others = [reader.submit(call) for reader, call in zip(self._readers, calls[1:], strict=True)]
         try:
             first = calls[0]()

@@ -1,8 +1,8 @@
-"""Dynamixel servos on one port: registers, the goals of all servos in one packet, their states in another.
+"""Dynamixel servos on one port: registers, goals in one packet, states in another.
 
-A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none of the last ones
-still awaits. So a reply that comes late is known as old and left out. Temperatures lie farther off and change slowly:
-only every 25th request is for a block that reaches as far.
+A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none
+of the last ones still awaits. So a reply that comes late is known as old and left out. Temperatures
+lie farther off and change slowly: only every 25th request is for a block that reaches as far.
 """
 
 import time
@@ -16,8 +16,19 @@ from elastic_env.core.signals import Array
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States, servo_name
 from elastic_env.hardware.buses.packets import word
-from elastic_env.hardware.buses.port import COMM_SUCCESS, DEFAULT_BAUDRATE, PacketHandler, Port, bus_gone
-from elastic_env.hardware.buses.servo_models import NUM_BLOCKS, ServoModel, explain_errors, servo_model
+from elastic_env.hardware.buses.port import (
+    COMM_SUCCESS,
+    DEFAULT_BAUDRATE,
+    PacketHandler,
+    Port,
+    bus_gone,
+)
+from elastic_env.hardware.buses.servo_models import (
+    NUM_BLOCKS,
+    ServoModel,
+    explain_errors,
+    servo_model,
+)
 from elastic_env.hardware.errors import HardwareError, ReplyError
 
 _TRIES = 3
@@ -199,7 +210,10 @@ class DynamixelBus:
         self.write(servo_id, "torque_enable", int(is_on))
 
     def write_watchdog(self, servo_id: int, is_on: bool) -> None:
-        """Set the bus watchdog of a servo to 60 ms, or clear it; nothing on models that have none."""
+        """Set the bus watchdog of a servo to 60 ms, or clear it.
+
+        Nothing on models that have none.
+        """
         if self.models[servo_id].has_watchdog:
             self.write(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
 
@@ -236,7 +250,11 @@ class DynamixelBus:
         """
         block = self._next_block()
         self._awaited.append(block)
-        self._send(packets.BROADCAST, packets.SYNC_READ, word(block.start) + word(len(block)) + bytes(self.ids))
+        self._send(
+            packets.BROADCAST,
+            packets.SYNC_READ,
+            word(block.start) + word(len(block)) + bytes(self.ids),
+        )
         self.port.setPacketTimeoutMillis(1e3 * timeout_s)
         replies: dict[int, bytes] = {}
         alerts: set[int] = set()
@@ -284,7 +302,10 @@ class DynamixelBus:
         )
 
     def _request(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
-        """The data of a reply; a few tries, with silence in between so that no late reply answers the next one."""
+        """The data of a reply.
+
+        A few tries, with silence in between so that no late reply answers the next one.
+        """
         problem = "does not answer"
         for _ in range(_TRIES):
             self._send(servo_id, instruction, parameters)
@@ -306,9 +327,9 @@ class DynamixelBus:
             self._wait_for_silence()
             self.num_retries += 1
         raise ReplyError(
-            f"{servo_name(self, servo_id)} {problem} in {_TRIES} tries ({self.port.baudrate} bit/s); check "
-            "power, wiring, id and baud rate, and whether this is the port of the servos and not the IMU's, see: "
-            f"elastic hardware scan {self.name}"
+            f"{servo_name(self, servo_id)} {problem} in {_TRIES} tries ({self.port.baudrate} "
+            "bit/s); check power, wiring, id and baud rate, and whether this is the port of the "
+            f"servos and not the IMU's, see: elastic hardware scan {self.name}"
         )
 
     def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:

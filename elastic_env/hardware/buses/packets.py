@@ -1,9 +1,9 @@
-"""Packets of Dynamixel Protocol 2.0: checksum, byte stuffing, instructions and status [ROBOTIS e-manual, protocol2].
+"""Packets of Dynamixel Protocol 2.0 [ROBOTIS e-manual, protocol2]: checksum, stuffing, status.
 
     FF FF FD 00  id  length (2)  instruction  parameters ...  CRC-16 (2)
 
-Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a header never occurs there; length and
-checksum count what is sent.
+Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a header never occurs
+there; length and checksum count what is sent.
 """
 
 from collections.abc import Sequence
@@ -160,8 +160,8 @@ class Parser:
             raw = bytes(self._bytes[: 7 + length])
             is_whole = len(raw) == 7 + length
             is_intact = is_whole and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
-            # in what is stuffed no header occurs, with the checksum behind it one may: only where the packet is not
-            # intact does a header before its end mean that the rest was lost
+            # in what is stuffed no header occurs, with the checksum behind it one may: only where
+            # the packet is not intact does a header before its end mean that the rest was lost
             again = self._bytes.find(HEADER, len(HEADER))
             if not is_intact and 0 < again < 7 + length:
                 del self._bytes[:again]

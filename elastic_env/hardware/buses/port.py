@@ -2,13 +2,13 @@
 
 | trap of dynamixel-sdk 4.1 | here |
 |---|---|
-| outgoing packets are not byte-stuffed | `PacketHandler.txPacket` sends what `packets.stuff` makes |
-| unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` is `packets.unstuff` |
+| outgoing packets are not byte-stuffed | `PacketHandler.txPacket` stuffs them |
+| unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` |
 | every reply may take 34 ms before it counts as missing | `DynamixelBus.reply_timeout_s` |
 | waiting for a reply is a busy loop | `Port` blocks in the read |
-| each reply is read in two pieces, by two calls of the system each | `Port.readPort` reads all that is there |
+| each reply is read in two pieces | `Port.readPort` reads all that is there |
 | an interrupted read leaves the port "in use", and torque off is refused | `Port.release` |
-| an unplugged port raises SerialException, or OSError, or termios.error | `bus_gone` makes one error of them |
+| an unplugged port raises one of three errors | `bus_gone` makes one error of them |
 | two programs can open one port and speak at the same time | `Port` locks it, see `port_lock` |
 """
 
@@ -49,8 +49,9 @@ def bus_gone(port: str) -> Iterator[None]:
         yield
     except (serial.SerialException, OSError, termios.error) as error:
         raise BusGoneError(
-            f"the bus at {port} is gone ({_reason(error)}): unplugged, or its adapter failed. Its servos may be under "
-            "torque: at their last goal, or where a bus watchdog has stopped them. Switch their power off"
+            f"the bus at {port} is gone ({_reason(error)}): unplugged, or its adapter failed. Its "
+            "servos may be under torque: at their last goal, or where a bus watchdog has stopped "
+            "them. Switch their power off"
         ) from None
 
 
@@ -136,7 +137,10 @@ class Port(PortHandler):
 
     @property
     def latency_timer_ms(self) -> int | None:
-        """How long a USB adapter collects bytes before it passes them on [ms]; None where nobody says."""
+        """How long a USB adapter collects bytes before it passes them on [ms].
+
+        None where nobody says.
+        """
         try:
             return int(self.latency_timer.read_text())
         except (OSError, ValueError):
@@ -147,7 +151,7 @@ class PacketHandler(Protocol2PacketHandler):
     """The SDK's packet handler with byte stuffing in both directions."""
 
     def txPacket(self, port: Any, txpacket: list[int]) -> Any:  # noqa: N802  the SDK's name
-        """Send an instruction that the SDK has laid out: id, instruction and parameters at their places."""
+        """Send an instruction that the SDK has laid out."""
         if port.is_using:
             return COMM_PORT_BUSY
         length = txpacket[5] | txpacket[6] << 8

@@ -1,8 +1,8 @@
-"""One program per serial port: the lock that everything that opens one takes first, before it touches the line.
+"""One program per serial port: the lock that is taken before anything touches the line.
 
-It is an advisory lock (flock): programs that take none are not refused. The stronger mark TIOCEXCL would refuse them,
-but it outlives a program that is killed while any other has the port open, and then keeps out the one that is to
-switch torque off.
+It is an advisory lock (flock): programs that take none are not refused. The stronger mark TIOCEXCL
+would refuse them, but it outlives a program that is killed while any other has the port open, and
+then keeps out the one that is to switch torque off.
 """
 
 import errno
@@ -20,7 +20,8 @@ def lock_port(name: str) -> int:
         name: Device, such as /dev/ttyUSB0.
 
     Returns:
-        A descriptor; the port is given back when it is closed, and by the system when the program ends.
+        A descriptor; the port is given back when it is closed, and by the system when the program
+        ends.
 
     Raises:
         PortError: There is no such port, it may not be opened, or another program has it.
@@ -43,7 +44,7 @@ def lock_port(name: str) -> int:
 
 
 def cannot_open(name: str, number: object, reason: str) -> PortError:
-    """The error of a port that the system does not open, with its cure, by number and text of the system's error."""
+    """The error, with its cure, of a port that the system does not open for a reason."""
     if number == errno.EBUSY:
         return _port_in_use(name)
     if number == errno.EACCES:
@@ -59,8 +60,8 @@ def cannot_open(name: str, number: object, reason: str) -> PortError:
 
 def _port_in_use(name: str) -> PortError:
     return PortError(
-        f"another program uses {name}; two on one bus would garble each other's packets. End that program "
-        f"(fuser {name} says which it is), or name another port"
+        f"another program uses {name}; two on one bus would garble each other's packets. End that "
+        f"program (fuser {name} says which it is), or name another port"
     )
 
 

@@ -1,8 +1,8 @@
 """Servo types as data: control tables, units, and the torque that a current stands for.
 
-`models.csv` lists the servos by the model number that they report, with the units of position, velocity and current.
-The other files beside this module are the maker's tables of registers. A new servo of the same protocol needs a row
-there and, if its registers differ, a table.
+`models.csv` lists the servos by the model number that they report, with the units of position,
+velocity and current. The other files beside this module are the maker's tables of registers. A new
+servo of the same protocol needs a row there and, if its registers differ, a table.
 """
 
 import csv
@@ -21,10 +21,16 @@ from elastic_env.hardware.errors import HardwareError
 from elastic_env.joint.dynamixel import LOSS_NM, SERVO, TORQUE_PER_CURRENT
 
 NUM_BLOCKS = 24
-"""Ways to read a servo's state; one is known as old for so many requests: 96 ms, over twice the longest patience."""
+"""Ways to read a servo's state.
+
+One is known as old for so many requests: 96 ms, over twice the longest patience.
+"""
 
 LARGEST_TORQUE_NM = SERVO.torque_limit
-"""Limit of the leg's servos of THORMANG3 [N·m], which is 20 A on the measured line; more hurts the gear."""
+"""Limit of the leg's servos of THORMANG3 [N·m], which is 20 A on the measured line.
+
+More hurts the gear.
+"""
 
 _RPM = 2.0 * math.pi / 60.0
 _MOTION = ("present_position", "present_velocity", "present_current")
@@ -81,7 +87,11 @@ class ControlTable(dict[str, Register]):
 
     def find(self, address: int) -> Register | None:
         """The register that holds an address, or None."""
-        return next((register for register in self.values() if register.address <= address < register.end), None)
+        return self._by_address.get(address)
+
+    @functools.cached_property
+    def _by_address(self) -> dict[int, Register]:
+        return {address: one for one in self.values() for address in range(one.address, one.end)}
 
     @property
     def size(self) -> int:
@@ -116,10 +126,10 @@ class ServoModel:
 
     @functools.cached_property
     def blocks(self) -> tuple[range, ...]:
-        """Addresses of the blocks that hold position, velocity and current, each longer than the last.
+        """Addresses of the blocks that hold the motion and the current, each longer than the last.
 
-        A block holds whole registers. The length of a reply tells which request it answers; the protocol has no
-        other mark of that.
+        A block holds whole registers. The length of a reply tells which request it answers; the
+        protocol has no other mark of that.
         """
         registers = self.table.values()
         first = min(self.table[name].address for name in _MOTION)
@@ -135,7 +145,10 @@ class ServoModel:
         return block.start <= register.address and register.end <= block.stop
 
     def decode_block(self, block: range, data: bytes) -> list[float]:
-        """Position [rad], velocity [rad/s], current [A] and temperature [°C] of a block; nan where it has none."""
+        """Position [rad], velocity [rad/s], current [A] and temperature [°C] of a block.
+
+        Nan where it has none.
+        """
         units = (self.position_unit, self.velocity_unit, self.current_unit)
         values = [unit * self._decode(name, block, data) for name, unit in zip(_MOTION, units, strict=True)]
         degrees = self._decode(_TEMPERATURE, block, data) if self.has_temperature(block) else math.nan
@@ -157,8 +170,8 @@ def servo_model(number: int) -> ServoModel:
     if number not in known:
         names = ", ".join(f"{model.number} ({model.name})" for model in known.values())
         raise HardwareError(
-            f"no control table for model number {number}; known are {names}. Writing registers of another model could "
-            "move it: add its table to elastic_env/hardware/buses"
+            f"no control table for model number {number}; known are {names}. Writing registers of "
+            "another model could move it: add its table to elastic_env/hardware/buses"
         )
     return known[number]
 
@@ -212,8 +225,9 @@ def explain_errors(status: int) -> str:
 def torque_of_current(current: npt.ArrayLike) -> Array:
     """Torque at the output for signed currents, by the line that was measured at an H54-200-S500-R.
 
-    |τ| = 4.338 N·m/A |I| − 2.694 N·m, and zero where the current only meets the losses. The line is rough: gear and
-    temperature change it. Source: a public ROS configuration, see `elastic_env/joint/dynamixel.py`.
+    |τ| = 4.338 N·m/A |I| − 2.694 N·m, and zero where the current only meets the losses. The line is
+    rough: gear and temperature change it. Source: a public ROS configuration, see
+    `elastic_env/joint/dynamixel.py`.
 
     Args:
         current: (...) [A].

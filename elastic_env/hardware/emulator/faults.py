@@ -8,7 +8,10 @@ _SHARE = {"ge": 0, "le": 1}
 
 
 class Faults(Model):
-    """Faults of an emulated bus; all of them off by default. Shares are drawn per reply, or per instruction."""
+    """Faults of an emulated bus; all of them off by default.
+
+    Shares are drawn per reply, or per instruction.
+    """
 
     unheard: float = quantity("1", 0.0, **_SHARE, description="share of instructions that reach no servo")
     lost: float = quantity("1", 0.0, **_SHARE, description="share of replies that do not come")

@@ -1,8 +1,9 @@
-"""The emulated MicroStrain IMU: attitudes of the link as packets of the MIP protocol, estimation filter set.
+"""The emulated MicroStrain IMU: attitudes of the link as packets of the MIP protocol.
 
     75 65  set  length  [field length  field  data ...] ...  checksum (2)
 
-Numbers are big endian; the checksum is Fletcher's, both sums modulo 256 (as the maker's SDK has it).
+Numbers are big endian; the checksum is Fletcher's, both sums modulo 256 (as the maker's SDK has
+it).
 """
 
 import math
@@ -58,7 +59,8 @@ class EmulatedImu:
             return
         noise = self._generator.standard_normal(1)
         roll = attitude(self._quality, np.array([q]), np.zeros(1), noise)
-        # a real IMU should never send the same three angles twice; the roll is as good as the scenario says
+        # a real IMU should never send the same three angles twice; the roll is as good as the
+        # scenario says
         pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
         angles = (math.remainder(float(roll[0]), 2.0 * math.pi), float(pitch), float(yaw))
         self._angles = distort(faults, angles, self._angles)

@@ -1,4 +1,4 @@
-"""The joints behind the emulated servos: the testbed's own plant in MuJoCo, one world per servo, in real time."""
+"""The joints behind the emulated servos: the testbed's plant, a world per servo, in real time."""
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array

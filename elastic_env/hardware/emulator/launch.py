@@ -38,7 +38,11 @@ class EmulatorConfig(Model):
     """The joints behind them, and through its scenario the quality of the IMU."""
     imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000, description="packets of the IMU per second")
     baudrate: int = quantity(
-        "bit/s", 3_000_000, ge=LOWEST_RATE, le=HIGHEST_RATE, description="rate of the bus; no other is heard"
+        "bit/s",
+        3_000_000,
+        ge=LOWEST_RATE,
+        le=HIGHEST_RATE,
+        description="rate of the bus; no other is heard",
     )
     faults: Faults = Faults()
     seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
@@ -66,18 +70,25 @@ class RunningEmulator(AbstractContextManager["RunningEmulator"]):
     def __init__(self, config: EmulatorConfig | None = None) -> None:
         text = (config or EmulatorConfig()).model_dump_json()
         self._process = start_child(
-            "elastic_env.hardware.emulator.process", text, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            "elastic_env.hardware.emulator.process",
+            text,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
         )
         self._take_ports(self._receive())
 
     def faults(self, **changes: Any) -> None:
-        """Switch faults on and off, see `Faults`; a bus that is plugged in again has another port."""
+        """Switch faults on and off, see `Faults`.
+
+        A bus that is plugged in again has another port.
+        """
         self._take_ports(self._request({"faults": changes}))
 
     def events(self) -> list[tuple[float, int, str, int]]:
         """Switches, goals and requests for states since the last call.
 
-        Monotonic time, id, register, value [count]; `present_position` is what a state that was asked for is to tell.
+        Monotonic time, id, register, value [count]; `present_position` is what a state that was
+        asked for is to tell.
         """
         return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._request({"events": True})]
 

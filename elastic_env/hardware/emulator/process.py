@@ -1,4 +1,4 @@
-"""The emulator's own process: pseudo-terminals in real time, and a line-based channel for faults and events."""
+"""The emulator's own process: pseudo-terminals in real time, a channel for faults and events."""
 
 import contextlib
 import fcntl
@@ -31,7 +31,7 @@ _PHYSICS_S = 2e-3  # between two advances, as a rule
 _LONGEST_PHYSICS_S = 5e-3  # and while replies go out
 _PACKET_BYTES = 62  # a USB adapter passes on as many bytes at once
 _PACKET_S = 1e-3  # or what it has after that time
-_SETTLE_S = 3e-4  # after a write, for the kernel to pass it on, which it does at a lower priority than ours
+_SETTLE_S = 3e-4  # after a write, for the kernel to pass it on at its lower priority
 _WAIT_S = 0.1
 _KEPT_EVENTS = 100_000
 _UNREAD_BYTES = 2000
@@ -39,7 +39,10 @@ _OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
 class Terminal:
-    """A pseudo-terminal that passes bytes through as they are; programs open its name as they would a serial port."""
+    """A pseudo-terminal that passes bytes through as they are.
+
+    Programs open its name as they would a serial port.
+    """
 
     def __init__(self) -> None:
         self.master, self._slave = pty.openpty()
@@ -48,7 +51,10 @@ class Terminal:
         self.name = os.ttyname(self._slave)
 
     def write(self, data: bytes) -> None:
-        """Pass bytes on; they are lost where nobody has read what is there, as on a line to nobody."""
+        """Pass bytes on.
+
+        They are lost where nobody has read what is there, as on a line to nobody.
+        """
         unread = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, b"\0\0\0\0"))[0]
         if unread > _UNREAD_BYTES:
             termios.tcflush(self._slave, termios.TCIFLUSH)
@@ -62,7 +68,10 @@ class Terminal:
         return b""
 
     def has_rate(self, baudrate: int) -> bool:
-        """True if the program at the other end has set a baud rate; one that the system has no name for passes."""
+        """True if the program at the other end has set a baud rate.
+
+        One that the system has no name for passes.
+        """
         return termios.tcgetattr(self._slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}")
 
     def close(self) -> None:
@@ -78,8 +87,8 @@ class Emulator:
         config: What is emulated.
 
     Attributes:
-        events: When, at which servo, which register became what: torque, goal and watchdog; and which position was
-            asked for.
+        events: When, at which servo, which register became what: torque, goal and watchdog; and
+            which position was asked for.
     """
 
     def __init__(self, config: EmulatorConfig) -> None:
@@ -90,7 +99,8 @@ class Emulator:
         self.events: deque[tuple[float, int, str, int]] = deque(maxlen=_KEPT_EVENTS)
         self.bus_terminal: Terminal | None = Terminal()
         self.imu_terminal = Terminal()
-        # each with a stream of its own: who asks for replies gets the same faults, whatever the time
+        # each with a stream of its own: who asks for replies gets the same faults, whatever the
+        # time
         self._reply_faults = np.random.default_rng([config.seed, 0])
         self._instruction_faults = np.random.default_rng([config.seed, 2])
         self._joints = Joints(config.testbed, len(config.ids), now)
@@ -105,7 +115,11 @@ class Emulator:
         self._settled_s = now
 
     def step(self, wait_s: float, control: int) -> bool:
-        """Wait for something to happen, and let it; whether the control channel has something to say."""
+        """Wait for something to happen, and let it.
+
+        Returns:
+            True if the control channel has something to say.
+        """
         sources = [control]
         if self.bus_terminal is not None:
             sources.append(self.bus_terminal.master)
@@ -118,7 +132,8 @@ class Emulator:
         has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
         if self.bus_terminal is not None and has_heard:
             now = self._hear(self.bus_terminal)
-        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:  # after the answers, which are urgent
+        # after the answers, which are urgent
+        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
             self._joints.advance(now)
         self._send_due(time.monotonic())
         self._imu.measure(self._joints.q[0], now, self.faults)
@@ -220,7 +235,10 @@ class Emulator:
 
 
 def serve(config: EmulatorConfig) -> None:
-    """Emulate until the input ends; requests come as JSON lines, one each, and so do the answers."""
+    """Emulate until the input ends.
+
+    Requests come as JSON lines, one each, and so do the answers.
+    """
     emulator = Emulator(config)
     prefer_realtime(Priority.EMULATOR)
     control = sys.stdin.fileno()

@@ -1,11 +1,16 @@
-"""Emulated servos: registers with their rules, answers to the instructions of Protocol 2.0, and their bus."""
+"""Emulated servos and their bus: registers with their rules, and the answers of Protocol 2.0."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from elastic_env.hardware.buses import packets
 from elastic_env.hardware.buses.packets import Packet, word, words
-from elastic_env.hardware.buses.servo_models import LARGEST_TORQUE_NM, Register, ServoModel, current_of_torque
+from elastic_env.hardware.buses.servo_models import (
+    LARGEST_TORQUE_NM,
+    Register,
+    ServoModel,
+    current_of_torque,
+)
 
 OVERLOAD = 1 << 5
 """Bit of an overload in the hardware error status."""
@@ -102,15 +107,16 @@ class EmulatedServo:
         self["present_temperature"] = _HOT_C if is_hot else _COOL_C
 
     def overload(self, is_overloaded: bool) -> None:
-        """Begin or end an overload: the status shows it, and the servo lets go (factory setting of shutdown)."""
+        """Begin or end an overload: the status shows it, and the servo lets go."""
         self["hardware_error_status"] = OVERLOAD if is_overloaded else 0
         if is_overloaded and self.is_on:
             self._change("torque_enable", 0)
 
     def watch(self, now_s: float) -> None:
-        """Stop where it is if the bus has been silent for longer than the watchdog allows (models that have one).
+        """Stop where it is if the bus has been silent for longer than the watchdog allows.
 
-        Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus Watchdog).
+        Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus
+        Watchdog).
         """
         if not self.model.has_watchdog or self["bus_watchdog"] <= 0:
             return
@@ -158,7 +164,10 @@ class EmulatedServo:
         return self._alert, bytes(self._memory[address : address + length])
 
     def write(self, address: int, data: bytes) -> int:
-        """Write whole registers from an address on; the error number, and then nothing is written."""
+        """Write whole registers from an address on.
+
+        The error number, and then nothing is written.
+        """
         values: dict[str, int] = {}
         end = address + len(data)
         while address < end:
@@ -200,7 +209,8 @@ class EmulatedServo:
     def _change(self, name: str, value: int) -> None:
         """Store a value with all that follows from it.
 
-        A servo that gets torque keeps its goal, and runs to it: nobody says of the real ones that they do not.
+        A servo that gets torque keeps its goal, and runs to it: nobody says of the real ones that
+        they do not.
         """
         self[name] = value
         if name == "id":
@@ -280,7 +290,7 @@ class EmulatedBus:
 
 
 def _join(replies: Sequence[tuple[int, int, bytes]]) -> bytes:
-    """A fast reply: one packet, in which every servo's part but the last ends with a checksum of all up to there."""
+    """A fast reply: the parts of all servos in one packet, each with a checksum of all so far."""
     length = 1 + sum(len(data) + 4 for _, _, data in replies)
     wire = packets.HEADER + bytes([packets.BROADCAST]) + word(length) + bytes([packets.STATUS])
     for servo_id, error, data in replies:

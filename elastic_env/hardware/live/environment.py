@@ -25,8 +25,9 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
 
     Args:
         port: Port of the servo.
-        **arguments: Those of `HardwareSettings`, and of `configure_testbed` of `elastic_env.robots.testbed.environment`
-            but for `form` and `timestep_s`; `scenario` can only be "hardware" or "nominal", and changes nothing.
+        **arguments: Those of `HardwareSettings`, and of `configure_testbed` of
+            `elastic_env.robots.testbed.environment` but for `form` and `timestep_s`; `scenario` can
+            only be "hardware" or "nominal", and changes nothing.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.

@@ -1,4 +1,4 @@
-"""Servo and IMU in the place of the physics: one control cycle on the bus is one advance of a `Simulation`."""
+"""Servo and IMU in the place of the physics: one control cycle is one advance of a `Simulation`."""
 
 import math
 import sys
@@ -44,15 +44,16 @@ class CycleTiming:
 class ServoPlant:
     """A servo on a bus, an IMU on its link; see `elastic_env.runtime.physics.Simulation`.
 
-    Nothing is opened before the first `begin`. A quantity that cannot be measured is nan: the link's rate, and without
-    an IMU its angle.
+    Nothing is opened before the first `begin`. A quantity that cannot be measured is nan: the
+    link's rate, and without an IMU its angle.
 
     Args:
         model: The testbed's model, whose state vectors it fills.
         at: Where motor and link angle stand in them.
         settings: Wiring, mounting and limits.
         period_s: Control period [s].
-        pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first motion [N·m].
+        pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first
+            motion [N·m].
     """
 
     num_worlds = 1
@@ -125,7 +126,8 @@ class ServoPlant:
         """Command `ctrl`, wait for the end of the control period, read.
 
         Raises:
-            HardwareError: No episode is under way, or something of the hardware is not as it must be.
+            HardwareError: No episode is under way, or something of the hardware is not as it must
+                be.
         """
         if self._bus is None:
             raise HardwareError(f"no episode is under way at {self.settings.port}: begin one with reset()")
@@ -137,14 +139,17 @@ class ServoPlant:
             self._cycle(float(self.ctrl[0, 0]))
 
     def finish(self) -> None:
-        """Slowly back to where the pendulum hangs, then torque off; the ports are free for other programs."""
+        """Slowly back to where the pendulum hangs, then torque off and ports closed."""
         try:
             self._move(self._goal, 0.0)
         finally:
             self.close()
 
     def close(self) -> None:
-        """Torque off; ports closed. An error or an interrupt on whose way out this happens gets a note of it."""
+        """Torque off; ports closed.
+
+        An error or an interrupt on whose way out this happens gets a note of it.
+        """
         bus = self._bus
         imu = self._imu
         self._bus = None
@@ -232,7 +237,10 @@ class ServoPlant:
         self._read_s = time.monotonic()
 
     def _cycle(self, angle: float) -> None:
-        """One control period; where the reply is missing the command is held and the cycle repeated."""
+        """One control period.
+
+        Where the reply is missing the command is held and the cycle repeated.
+        """
         bus = self._open_bus()
         missed = 0
         overruns = 0
@@ -271,7 +279,10 @@ class ServoPlant:
             self.qpos[0, self._at.q[0]] = q
 
     def _require_together(self, q: float, age_s: float) -> None:
-        """Refuse a link that is where no gear bends to; the motor has moved on since the IMU measured."""
+        """Refuse a link that is where no gear bends to.
+
+        The motor has moved on since the IMU measured.
+        """
         settings = self.settings
         deflection = q - float(self.qpos[0, self._at.theta[0]])
         if math.isfinite(deflection):  # of others there is no remainder, and they are too far
@@ -279,8 +290,9 @@ class ServoPlant:
         moved = abs(float(self.qvel[0, self._at.theta_dot[0]])) * max(age_s, 0.0)
         if exceeds(abs(deflection), settings.largest_deflection_rad + moved):
             raise HardwareError(
-                f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} rad from the servo's angle, more "
-                f"than largest_deflection_rad {settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
+                f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} rad from the "
+                "servo's angle, more than largest_deflection_rad "
+                f"{settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
                 "imu_offset_rad of the mounting, or look what has come loose"
             )
 
@@ -298,14 +310,15 @@ def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: flo
     """
     limits = settings.limits
     question = (
-        f"The servo at {settings.port} will move to {angle:.3f} rad, then anywhere between its limits, "
-        f"{limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of {pendulum_nm:.1f} N·m. Is "
-        "its way free, and the power switch in reach? Type the whole word yes: "
+        f"The servo at {settings.port} will move to {angle:.3f} rad, then anywhere between its "
+        f"limits, {limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of "
+        f"{pendulum_nm:.1f} N·m. Is its way free, and the power switch in reach? Type the whole "
+        "word yes: "
     )
     if not sys.stdin.isatty():
         raise HardwareError(
-            f"nobody is at the terminal to agree to a motion at {settings.port}; if the way is free, say so "
-            "by --yes, in Python by confirm=False"
+            f"nobody is at the terminal to agree to a motion at {settings.port}; if the way is "
+            "free, say so by --yes, in Python by confirm=False"
         )
     try:
         answer = input(question)

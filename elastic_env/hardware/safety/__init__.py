@@ -1,1 +1,1 @@
-"""Safety of a moving joint: limits, a supervisor in a process of its own, checks before the motion."""
+"""Safety of a moving joint: limits, a supervisor process, checks before the motion."""

@@ -1,4 +1,7 @@
-"""Checks before anything moves: firmware, voltage, temperature, errors, delays; each with its cure."""
+"""Checks before anything moves: firmware, voltage, temperature, errors, delays.
+
+Each with its cure.
+"""
 
 import statistics
 import time
@@ -54,7 +57,11 @@ def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
         HardwareError: Its model is not known.
     """
     bus.attach(ids)
-    checks = [Check("baud rate", f"{bus.port.baudrate} bit/s"), _check_latency(bus), *_check_round_trips(bus, ids[0])]
+    checks = [
+        Check("baud rate", f"{bus.port.baudrate} bit/s"),
+        _check_latency(bus),
+        *_check_round_trips(bus, ids[0]),
+    ]
     for servo_id, model in bus.models.items():
         checks += [replace(check, what=f"{servo_id}: {check.what}") for check in _check_servo(bus, servo_id, model)]
     return checks
@@ -78,14 +85,19 @@ def _check_round_trips(bus: DynamixelBus, servo_id: int) -> list[Check]:
     lost = bus.num_retries - retries
     typical = statistics.median(times)
     faster = (
-        "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to 0, and the bus to "
-        "1 Mbit/s or more"
+        "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to "
+        "0, and the bus to 1 Mbit/s or more"
     )
     better = "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer busy"
     trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(times):.2f} ms"
     return [
         Check("round trip of a ping", trip, _unless(typical < _SLOW_S, faster)),
-        Check("lost replies", f"{lost} of {_PINGS} pings", _unless(lost < _LOST, better), is_vital=False),
+        Check(
+            "lost replies",
+            f"{lost} of {_PINGS} pings",
+            _unless(lost < _LOST, better),
+            is_vital=False,
+        ),
     ]
 
 
@@ -125,7 +137,12 @@ def _check_servo(bus: DynamixelBus, servo_id: int, model: ServoModel) -> list[Ch
         Check("operating mode", str(mode), _unless(mode == _POSITION_MODE, mend_mode)),
         Check("return delay", f"{delay_us} µs", _unless(delay_us <= _LONGEST_DELAY_US, mend_delay)),
         Check("status return level", str(level), _unless(level == _FULL_REPLIES, mend_level)),
-        Check("current limit", f"{amperes:.1f} A", _unless(amperes <= strongest + 0.1, mend_limit), is_vital=False),
+        Check(
+            "current limit",
+            f"{amperes:.1f} A",
+            _unless(amperes <= strongest + 0.1, mend_limit),
+            is_vital=False,
+        ),
         Check("position", f"{bus.read_position(servo_id):+.4f} rad"),
         Check("position limits", f"{lowest:.2f} to {highest:.2f} rad"),
         Check("torque", "on" if is_on else "off", _unless(not is_on, left_on), is_vital=False),

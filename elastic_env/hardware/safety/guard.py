@@ -1,7 +1,7 @@
-"""The last layer before the wire: keeps commands within their limits, and stops a motion that leaves them.
+"""The last layer before the wire: limits commands, and stops a motion that leaves its limits.
 
-Whatever is not a finite number is beyond every bound. `nan > limit` is False, so that a plain comparison would let a
-motion go on whose measurement is none.
+Whatever is not a finite number is beyond every bound. `nan > limit` is False, so that a plain
+comparison would let a motion go on whose measurement is none.
 """
 
 from collections.abc import Sequence
@@ -16,11 +16,16 @@ from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.settings import SafetyLimits
 
 _LONGEST_WITHOUT_TEMPERATURE = 2 * TEMPERATURE_CYCLES + 10
-"""Cycles without a servo's temperature that stop the motion; replies that are missing for longer do so before."""
+"""Cycles without a servo's temperature that stop the motion.
+
+Replies that are missing for longer do so before.
+"""
 
 
 def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
-    """True where a value is not known to be at most a limit: it is greater, or one of the two is nan or infinite.
+    """True where a value is not known to be at most a limit.
+
+    It is greater, or one of the two is nan or infinite.
 
     Args:
         value: (...), in the unit of the limit.
@@ -35,7 +40,10 @@ def exceeds(value: npt.ArrayLike, limit: npt.ArrayLike) -> BoolArray:
 
 
 def is_outside(value: npt.ArrayLike, lowest: npt.ArrayLike, highest: npt.ArrayLike) -> BoolArray:
-    """True where a value is not known to lie between two bounds, or on one of them; shapes as in `exceeds`."""
+    """True where a value is not known to lie between two bounds, or on one of them.
+
+    Shapes as in `exceeds`.
+    """
     return exceeds(value, highest) | exceeds(np.negative(value), np.negative(lowest))
 
 
@@ -44,17 +52,22 @@ class Guard:
 
     Args:
         limits: The limits, the same for all servos.
-        measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead away from there as
-            fast as the limits allow.
+        measured: Positions where the motion begins, (n,) [rad]; the first commands can only lead
+            away from there as fast as the limits allow.
         names: The servos' names in messages, (n,).
-        hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower one of each and the limit holds.
+        hottest: Temperatures that the servos' own settings allow, (n,) [°C]; the lower one of each
+            and the limit holds.
 
     Raises:
         FaultError: A position lies outside the goals' range, or is not known.
     """
 
     def __init__(
-        self, limits: SafetyLimits, measured: Array, names: Sequence[str], hottest: npt.ArrayLike = np.inf
+        self,
+        limits: SafetyLimits,
+        measured: Array,
+        names: Sequence[str],
+        hottest: npt.ArrayLike = np.inf,
     ) -> None:
         n = len(measured)
         self.limits = limits
@@ -69,14 +82,15 @@ class Guard:
         outside = is_outside(self.goals, limits.lowest_rad, limits.highest_rad)
         if outside.any():
             raise FaultError(
-                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} rad in the servos' "
-                f"own angles, not where these stand: {self._list(outside, self.goals)} rad; move them by hand while "
-                "torque is off, correct zero_rad and direction of the mounting, or widen the limits"
+                f"motion must begin between {limits.lowest_rad:.3f} and {limits.highest_rad:.3f} "
+                "rad in the servos' own angles, not where these stand: "
+                f"{self._list(outside, self.goals)} rad; move them by hand while torque is off, "
+                "correct zero_rad and direction of the mounting, or widen the limits"
             )
 
     @property
     def is_holding(self) -> bool:
-        """True if a reply was missing in the last cycle: the last command is then repeated, whatever is asked for."""
+        """True if a reply was missing in the last cycle, and so the last command is repeated."""
         return bool(self._without_reply.any())
 
     def command(self, goals: Array, elapsed_s: float) -> tuple[Array, BoolArray]:
@@ -121,8 +135,9 @@ class Guard:
         lost = self._without_reply >= limits.patience_cycles
         if lost.any():
             return (
-                f"no usable reply from {self._list(lost)} in {limits.patience_cycles} cycles in a row; look at cables "
-                "and power, the adapter's latency timer, and what else keeps the computer busy: elastic hardware check"
+                f"no usable reply from {self._list(lost)} in {limits.patience_cycles} cycles in a "
+                "row; look at cables and power, the adapter's latency timer, and what else keeps "
+                "the computer busy: elastic hardware check"
             )
         lowest = limits.lowest_rad - limits.margin_rad
         highest = limits.highest_rad + limits.margin_rad
@@ -134,12 +149,14 @@ class Guard:
             )
         fast = is_fresh & exceeds(np.abs(states.velocity), limits.speed_rad_s)
         if fast.any():
-            return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {self._list(fast, states.velocity)} rad/s"
+            speeds = self._list(fast, states.velocity)
+            return f"a speed exceeds {limits.speed_rad_s:g} rad/s: {speeds} rad/s"
         behind = is_fresh & exceeds(np.abs(states.position - self.goals), limits.following_error_rad)
         if behind.any():
             return (
-                f"a servo is further than {limits.following_error_rad:g} rad from its goal, blocked or overloaded: "
-                f"{self._list(behind, states.position)}, goal {np.round(self.goals[behind], 3).tolist()} rad"
+                f"a servo is further than {limits.following_error_rad:g} rad from its goal, "
+                f"blocked or overloaded: {self._list(behind, states.position)}, goal "
+                f"{np.round(self.goals[behind], 3).tolist()} rad"
             )
         return self._check_load(states) or self._check_heat(states.temperature)
 
@@ -149,7 +166,8 @@ class Guard:
         self._strained = np.where(states.is_fresh, strained, self._strained)  # a missing reply tells neither way
         too_long = states.is_fresh & (self._strained >= self.limits.patience_cycles)
         if too_long.any():
-            return f"the torque exceeds {self.limits.torque_nm:g} N·m: {self._list(too_long, torque)} N·m"
+            torques = self._list(too_long, torque)
+            return f"the torque exceeds {self.limits.torque_nm:g} N·m: {torques} N·m"
         return ""
 
     def _check_heat(self, temperature: Array) -> str:
@@ -161,7 +179,8 @@ class Guard:
         unknown = self._without_temperature > _LONGEST_WITHOUT_TEMPERATURE
         if unknown.any():
             cycles = _LONGEST_WITHOUT_TEMPERATURE
-            return f"no temperature from {self._list(unknown)} in {cycles} cycles: elastic hardware check"
+            names = self._list(unknown)
+            return f"no temperature from {names} in {cycles} cycles: elastic hardware check"
         return ""
 
     def _list(self, are: BoolArray, values: Array | None = None) -> str:
@@ -181,6 +200,6 @@ def explain_heat(which: str, hottest: Array) -> str:
     """
     allowed = ", ".join(f"{degrees:g}" for degrees in np.atleast_1d(hottest))
     return (
-        f"too hot: {which} °C, at most {allowed} °C are allowed (temperature_c, or the servo's own temperature_limit); "
-        "let it cool, and look for what it has to hold or what blocks it"
+        f"too hot: {which} °C, at most {allowed} °C are allowed (temperature_c, or the servo's own "
+        "temperature_limit); let it cool, and look for what it has to hold or what blocks it"
     )

@@ -1,12 +1,13 @@
-"""Processes beside the program: how they start, what they say to each other, and how one sees that another ends.
+"""Processes beside the program: how they start, talk to each other, and are seen to end.
 
-`python -m` puts the working directory first on the import path. A `serial.py` that lies there would run in the process
-that is to switch torque off. Here a child
+`python -m` puts the working directory first on the import path. A `serial.py` that lies there would
+run in the process that is to switch torque off. Here a child
 
-* has no working directory on its path: by `-P`, and by a PYTHONPATH without it in whatever spelling. Everything else
-  of PYTHONPATH and the user's own packages stay, since the driver's packages may be installed there (`-I` would drop
-  them);
-* loads our packages from where this program has them, which may be the working directory, without looking for them.
+* has no working directory on its path: by `-P`, and by a PYTHONPATH without it in whatever
+  spelling. Everything else of PYTHONPATH and the user's own packages stay, since the driver's
+  packages may be installed there (`-I` would drop them);
+* loads our packages from where this program has them, which may be the working directory, without
+  looking for them.
 
 This file is the first that a child runs: it imports the standard library alone.
 """
@@ -60,7 +61,10 @@ def start_child(module: str, *arguments: str, **options: Any) -> "subprocess.Pop
 
 
 def end_child(process: "subprocess.Popen[str]", within_s: float) -> None:
-    """End a child that stops when its input is closed; one that does not within a time [s] is killed."""
+    """End a child that stops when its input is closed.
+
+    One that does not within a time [s] is killed.
+    """
     for pipe in (process.stdin, process.stdout, process.stderr):
         if pipe is not None:
             pipe.close()
@@ -72,7 +76,7 @@ def end_child(process: "subprocess.Popen[str]", within_s: float) -> None:
 
 
 def child_environment(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """The environment of a child: that of this program, its PYTHONPATH without the working directory.
+    """The environment of a child: this program's, with no working directory in its PYTHONPATH.
 
     Args:
         environment: Variables by name, default those of this program.
@@ -155,10 +159,13 @@ class Channel:
 
 
 def is_ending(process_id: int, proc: Path = _PROC) -> bool:
-    """True if a process has been killed, ends, writes its core, or is gone; False where the system does not tell.
+    """True if a process has been killed, ends, writes its core, or is gone.
 
-    A program that is killed closes its end of a channel late. It first needs a processor to end on, and gives its
-    memory back before its files. On a busy computer that takes as long as a hang does. Linux tells of it at once.
+    False where the system does not tell.
+
+    A program that is killed closes its end of a channel late. It first needs a processor to end on,
+    and gives its memory back before its files. On a busy computer that takes as long as a hang
+    does. Linux tells of it at once.
 
     Args:
         process_id: Of the process.

@@ -13,7 +13,7 @@ LONGEST_WAIT_S = 0.02
 
 
 class Priority(IntEnum):
-    """Order of the processes: those that end a motion go before those that move, however busy these are."""
+    """Order of the processes: those that end a motion go before those that move, however busy."""
 
     LOOP = 5
     IMU_READER = 10
@@ -22,13 +22,18 @@ class Priority(IntEnum):
 
 
 def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
-    """Ask for real-time scheduling of this thread; whether the system grants it (it needs the right to, see docs).
+    """Ask for real-time scheduling of this thread, to which a program needs the right, see docs.
 
-    What is in memory now is left out of garbage collections: one that looks at all of it takes ten control periods.
+    What is in memory now is left out of garbage collections: one that looks at all of it takes ten
+    control periods.
 
     Args:
         priority: Among the processes of a motion.
-        with_threads: Whether threads and programs that it starts from now on get the same; else they run as others do.
+        with_threads: True if threads and programs that it starts from now on get the same; else
+            they run as others do.
+
+    Returns:
+        True if the system grants it.
     """
     gc.collect()
     gc.freeze()
@@ -52,7 +57,8 @@ def schedule_like(thread_id: int) -> None:
 def give_up_realtime() -> None:
     """Back to the scheduling of all others, and to collections of everything."""
     gc.unfreeze()
-    with contextlib.suppress(OSError, AttributeError):  # the flag may be taken back with special rights only
+    # the flag may be taken back with special rights only
+    with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
 
 
@@ -66,8 +72,9 @@ def sleep_until(moment_s: float) -> None:
 class Pace:
     """Moments at which a control loop reads, one period after the other.
 
-    Small delays are caught up with. An overrun is a period whose command comes, or whose reading happens, more than
-    half a period late: a new one begins there, so that one hold-up counts once and what follows has its whole time.
+    Small delays are caught up with. An overrun is a period whose command comes, or whose reading
+    happens, more than half a period late: a new one begins there, so that one hold-up counts once
+    and what follows has its whole time.
 
     Args:
         period_s: Time between readings [s].

@@ -1,4 +1,4 @@
-"""A program's side of the supervisor: servos that lose their torque when the program does not behave."""
+"""A program's side of the supervisor: servos that lose their torque when it does not behave."""
 
 import contextlib
 import subprocess
@@ -15,7 +15,13 @@ from elastic_env.hardware.buses.bus import BusGroup, States
 from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
 from elastic_env.hardware.buses.packets import require_ids
 from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
-from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
+from elastic_env.hardware.errors import (
+    BusGoneError,
+    FaultError,
+    HardwareError,
+    PortError,
+    ReplyError,
+)
 from elastic_env.hardware.safety.processes import Channel, start_child
 from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
 from elastic_env.hardware.settings import SafetyLimits
@@ -23,9 +29,12 @@ from elastic_env.hardware.settings import SafetyLimits
 _ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
-"""Longest silence of a supervisor beyond what was asked for [s]; then it is taken for dead, and torque switched off.
+"""Longest silence of a supervisor beyond what was asked for [s].
 
-In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the other wait too.
+Then it is taken for dead, and torque switched off.
+
+In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the
+other wait too.
 """
 _LEAST_ANSWER_S = 0.02
 _READ_S = 0.05
@@ -59,7 +68,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
 
     Attributes:
         models: Model numbers of the servos, a list for each port.
-        is_confirmed_off: Whether all servos have said that their torque is off, and nothing has enabled it since.
+        is_confirmed_off: Whether all servos have said that their torque is off, and nothing has
+            enabled it since.
 
     Raises:
         PortError: A port cannot be had.
@@ -159,7 +169,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         return States.load(self._request("read", _READ_S + self._answer_s))
 
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
-        """Hold goals from a thread until the next cycle, for at most a time: between moving and stepping.
+        """Hold goals from a thread until the next cycle, for at most a time [s].
 
         A program that hangs as a whole takes the thread with it, and torque goes off as ever.
         """
@@ -184,7 +194,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
                 self._exchange(goals, time.monotonic() + _KEEP_ALIVE_S)
 
     def _exchange(self, goals: Array, at: float) -> dict[str, Any]:
-        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan as its second value
+        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan
+        # as its second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
         return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
 
@@ -205,7 +216,8 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         """Torque off, and give the ports back; a second time does nothing.
 
         Raises:
-            ReplyError: A servo does not confirm that its torque is off; the ports are given back all the same.
+            ReplyError: A servo does not confirm that its torque is off; the ports are given back
+                all the same.
             BusGoneError: The port is gone.
         """
         try:
@@ -239,7 +251,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             answer = self._channel.receive()
             if answer is None:
                 raise self._replace_supervisor()
-            if "busy" in answer:  # torque off is sent, whoever asked for it; its confirmation may take
+            if "busy" in answer:  # torque off is sent; its confirmation takes longer
                 within_s = self._slow_s
                 end_s = time.monotonic() + within_s
             elif answer["number"] == number:
@@ -250,7 +262,7 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         raise self._replace_supervisor(within_s)
 
     def _replace_supervisor(self, silent_s: float | None = None) -> FaultError:
-        """Switch torque off in the place of a supervisor that died, or was silent for a time [s] and had to."""
+        """Switch torque off for a supervisor that died, or was silent for a time [s]."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
         if silent_s is None:
@@ -261,14 +273,17 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
 
 
 def emergency_stop(
-    ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE, models: Sequence[Sequence[int]] = ()
+    ports: Mapping[str, Sequence[int]],
+    baudrate: int = DEFAULT_BAUDRATE,
+    models: Sequence[Sequence[int]] = (),
 ) -> str:
     """Switch torque off without a supervisor.
 
     Args:
         ports: Ids of the servos by port.
         baudrate: Bits per second.
-        models: Their model numbers, in that order; where they are not given each servo is asked for its own first.
+        models: Their model numbers, in that order; where they are not given each servo is asked for
+            its own first.
 
     Returns:
         What came of it, in words.

@@ -1,9 +1,10 @@
-"""The process that owns the servos' ports: it relays, keeps the limits, and switches torque off when it must.
+"""The process that owns the servos' ports: it relays, keeps limits, and switches torque off.
 
-It lives in a session of its own, so that neither Ctrl-C nor the death of the program that started it ends it before
-torque is off. Torque goes off when
+It lives in a session of its own, so that neither Ctrl-C nor the death of the program that started
+it ends it before torque is off. Torque goes off when
 
-* the program ends, however it ends: its end of the channel closes, or Linux says that it is about to;
+* the program ends, however it ends: its end of the channel closes, or Linux says that it is about
+  to;
 * no command comes for `SafetyLimits.hang_s`: the program hangs;
 * the `Guard` finds a reason in what is measured;
 * it is itself asked to end (SIGTERM, SIGHUP, SIGINT), also during a read, also more than once.
@@ -25,14 +26,22 @@ from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError
 from elastic_env.hardware.safety.checks import check_bus
 from elastic_env.hardware.safety.guard import Guard, exceeds, explain_heat
 from elastic_env.hardware.safety.processes import Channel, is_ending
-from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, Priority, prefer_realtime, sleep_until
+from elastic_env.hardware.safety.realtime import (
+    LONGEST_WAIT_S,
+    Priority,
+    prefer_realtime,
+    sleep_until,
+)
 from elastic_env.hardware.settings import SafetyLimits
 
 _REPLY_TIMEOUT_S = 0.003
 _GLANCE_S = 0.005
 """Silence after which to look whether the program lives; a command comes every 4 ms [s]."""
 _REST_RAD_S = 0.2
-"""Speed below which a servo counts as at rest [rad/s]; one that gets its torque in motion is stopped with a jerk."""
+"""Speed below which a servo counts as at rest [rad/s].
+
+One that gets its torque in motion is stopped with a jerk.
+"""
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 
@@ -120,7 +129,8 @@ class Supervisor:
     def _enable(self, limits: dict[str, Any]) -> dict[str, Any]:
         """Torque on, with every servo's goal where it stands."""
         if isinstance(self._fault, BusGoneError):
-            raise self._fault.with_traceback(None)  # for good: what is plugged in again is another port
+            # for good: what is plugged in again is another port
+            raise self._fault.with_traceback(None)
         self._disable()
         safety_limits = SafetyLimits(**limits)
         servos = self._servos.servos
@@ -135,7 +145,8 @@ class Supervisor:
             for bus, servo_id in servos:
                 bus.write_watchdog(servo_id, False)
             for (bus, servo_id), angle in zip(servos, positions.tolist(), strict=True):
-                bus.write_goal(servo_id, angle)  # confirmed: with torque, a servo may run to the goal it has
+                # confirmed: with torque, a servo may run to the goal it has
+                bus.write_goal(servo_id, angle)
             for bus, servo_id in servos:
                 bus.write_torque(servo_id, True)
             self._servos.write_goals(positions)
@@ -152,7 +163,10 @@ class Supervisor:
         return {"position": positions.tolist()}
 
     def _exchange(self, goals: list[float], at: float) -> dict[str, Any]:
-        """Command, wait for a moment, read; the moment is on the monotonic clock, which both processes share."""
+        """Command, wait for a moment, read.
+
+        The moment is on the monotonic clock, which both processes share.
+        """
         guard = self._require_motion()
         now = time.monotonic()
         if exceeds(at - now, LONGEST_WAIT_S):
@@ -207,11 +221,12 @@ class Supervisor:
         return f" ({'; '.join(errors)})" if errors else ""
 
     def _stop(self, reason: str, is_gone: bool = False) -> HardwareError:
-        """End the motion for a reason, which may be that a bus is gone: the error that answers from now on."""
+        """End the motion for a reason; returns the error that answers from now on."""
         problem = self._torque_off()
         outcome = "torque is off" if problem is None else str(problem)
         kind = BusGoneError if isinstance(problem, BusGoneError) else FaultError
-        is_said = reason in outcome or (is_gone and kind is BusGoneError)  # by torque off, which met the same
+        # torque off met the same loss
+        is_said = reason in outcome or (is_gone and kind is BusGoneError)
         self._fault = kind(outcome if is_said else f"{reason}; {outcome}")
         return self._fault
 
@@ -221,7 +236,10 @@ class Supervisor:
         return self._servos.torque_off(self._say_busy)
 
     def _say_busy(self) -> None:
-        """Tell the program, which takes a supervisor that is silent for dead, that torque off takes its time."""
+        """Tell the program that torque off takes its time.
+
+        It takes a silent supervisor for dead.
+        """
         with contextlib.suppress(OSError):
             self._channel.send({"number": self._number, "busy": True})
 
@@ -247,8 +265,8 @@ def require_rest(bus: Bus, servo_id: int) -> None:
     speed = abs(bus.read_velocity(servo_id))
     if exceeds(speed, _REST_RAD_S):
         raise FaultError(
-            f"{servo_name(bus, servo_id)} moves at {speed:.2f} rad/s; torque goes on at rest, below {_REST_RAD_S:g} "
-            "rad/s: wait until it hangs still, then try again"
+            f"{servo_name(bus, servo_id)} moves at {speed:.2f} rad/s; torque goes on at rest, "
+            f"below {_REST_RAD_S:g} rad/s: wait until it hangs still, then try again"
         )
 
 
@@ -269,14 +287,14 @@ def require_cool(bus: Bus, servo_id: int, limit_c: float) -> float:
 
 
 def _end(signal_number: int, _: Any) -> None:
-    """End by an exception, once: signals that come on the way out must not keep torque off from being sent."""
+    """End by an exception, once: a second signal must not keep torque off from being sent."""
     for number in _SIGNALS:
         signal.signal(number, _ignore)
     raise SystemExit(128 + signal_number)
 
 
 def _ignore(signal_number: int, _: Any) -> None:
-    """In the place of SIG_IGN, with which Python would complain of a signal that had come just before."""
+    """In the place of SIG_IGN, with which Python complains of a signal that came just before."""
 
 
 def main(ports: list[str], baudrate: int, channel: Channel) -> None:
