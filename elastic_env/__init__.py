@@ -24,7 +24,7 @@ __all__ = [
 
 _ENVIRONMENTS = (
     "elastic_env.robots.testbed", "elastic_env.robots.thormang", "elastic_env.robots.robot",
-    "elastic_env.hardware.testbed",
+    "elastic_env.hardware.live",
 )  # fmt: skip
 """Packages that say NAME and ID of an environment, and make it in a module `environment`."""
 

@@ -3,6 +3,7 @@
 import math
 import operator
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,21 +13,19 @@ from rich.console import Console
 
 from elastic_env.core.config import Model
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware import imu
+from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.errors import FaultError, HardwareError
-from elastic_env.hardware.imu import attitude
-from elastic_env.hardware.imu.attitude import AttitudeError, AttitudeStream
-from elastic_env.hardware.imu.attitude_sample import Attitude, PlausibleAttitudes
+from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, PlausibleAttitudes
 from elastic_env.hardware.safety import supervisor
-from elastic_env.hardware.safety.bounds import exceeds, is_outside
-from elastic_env.hardware.safety.limits import Guard, SafetyLimits
+from elastic_env.hardware.safety.guard import Guard, exceeds, is_outside
 from elastic_env.hardware.safety.realtime import Pace
-from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.hardware.settings import HardwareSettings, SafetyLimits
 from elastic_env.robots.testbed.model import Pendulum
 from tests.test_hardware_safety import states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import StillBus, make_still, still  # noqa: F401  a fixture
-from train.hardware.session import emulate
+from train.hardware import emulate
 
 NO_NUMBERS = [math.nan, math.inf, -math.inf]
 no_number = pytest.mark.parametrize("value", NO_NUMBERS)
@@ -49,7 +48,7 @@ def test_a_state_that_is_no_number_stops_the_motion_at_once(what: str, value: fl
     """Catches a measurement that no limit is exceeded by: `abs(nan) > limit` is False."""
     measured = states([0.0, 0.0])
     getattr(measured, what)[1] = value
-    said = Guard(SafetyLimits(), np.zeros(2), ["one", "two"]).take(measured)
+    said = Guard(SafetyLimits(), np.zeros(2), ["one", "two"]).check(measured)
     assert "of two is not a finite number" in said
 
 
@@ -91,9 +90,9 @@ def test_a_request_with_what_is_no_number_switches_torque_off(what: str, value: 
 @no_number
 def test_torque_goes_on_where_a_speed_is_known_only(value: float) -> None:
     """Catches a servo at an unknown speed that counts as at rest."""
-    bus: Any = SimpleNamespace(name="one", velocity=lambda _: value)
+    bus: Any = SimpleNamespace(name="one", read_velocity=lambda _: value)
     with pytest.raises(FaultError, match="torque goes on at rest"):
-        supervisor._require_rest(bus, 1)
+        supervisor.require_rest(bus, 1)
 
 
 @no_number
@@ -136,7 +135,7 @@ def after(time_s: float, **angles: float) -> Attitude:
 @pytest.mark.parametrize("value", [*NO_NUMBERS, 3.2, -3.2, 1e30])
 def test_angles_that_no_imu_can_measure_are_named(axis: str, value: float) -> None:
     """Catches what an IMU calls valid: nan, inf, and angles outside ±π or, for the pitch, ±π/2."""
-    said = PlausibleAttitudes(0.05).problem(after(10.0, **{axis: value}))
+    said = PlausibleAttitudes(0.05).check(after(10.0, **{axis: value}))
     assert f"sends {axis} = {value:g} rad" in said
     assert "must lie between" in said
 
@@ -146,14 +145,14 @@ def test_the_ends_of_the_range_are_angles() -> None:
     for sign in (1, -1):
         end = sign * float(np.float32(np.pi))
         half = sign * float(np.float32(np.pi / 2))
-        assert PlausibleAttitudes(0.05).problem(after(10.0, roll=end, pitch=half, yaw=end)) == ""
-        assert "pitch" in PlausibleAttitudes(0.05).problem(after(10.0, pitch=1.001 * half))
+        assert PlausibleAttitudes(0.05).check(after(10.0, roll=end, pitch=half, yaw=end)) == ""
+        assert "pitch" in PlausibleAttitudes(0.05).check(after(10.0, pitch=1.001 * half))
 
 
 def test_an_imu_that_repeats_itself_is_frozen_when_an_attitude_may_be_no_older() -> None:
     """Catches a filter that stands still while its packets go on, and a false alarm at two equal samples."""
     plausible = PlausibleAttitudes(oldest_s=0.055)
-    found = [plausible.problem(after(10.0 + 0.01 * k)) for k in range(7)]
+    found = [plausible.check(after(10.0 + 0.01 * k)) for k in range(7)]
     assert found[:6] == [""] * 6
     assert "the same attitude in all bits for 60 ms, 55 ms are allowed (imu_oldest_s)" in found[6]
 
@@ -164,7 +163,7 @@ def test_one_angle_that_changes_by_a_bit_is_life(axis: str) -> None:
     plausible, angle = PlausibleAttitudes(oldest_s=0.05), np.float32(0.1)
     for k in range(100):
         angle = np.nextafter(angle, np.float32(1.0))
-        assert plausible.problem(after(10.0 + 0.01 * k, **{axis: float(angle)})) == ""
+        assert plausible.check(after(10.0 + 0.01 * k, **{axis: float(angle)})) == ""
 
 
 @pytest.mark.parametrize("time_s", [*NO_NUMBERS, 99.9, 100.1])
@@ -184,7 +183,7 @@ def test_the_stream_gives_nobody_what_is_no_angle(value: float, monkeypatch: pyt
 
 def _stream(sample: Callable[[], Attitude], monkeypatch: pytest.MonkeyPatch) -> AttitudeStream:
     """A stream without a process, at 100 s of its clock."""
-    monkeypatch.setattr(attitude, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    monkeypatch.setattr(imu, "time", SimpleNamespace(monotonic=lambda: 100.0))
     stream = AttitudeStream.__new__(AttitudeStream)
     stream.port, stream._oldest_s, stream._plausible = "here", 0.05, PlausibleAttitudes(0.05)
     stream._shared, stream._lock = SimpleNamespace(get=sample), None  # type: ignore[assignment]
@@ -224,7 +223,7 @@ def test_the_first_cycle_that_sees_it_stops_the_motion(
             now(),
             **({"roll": 0.0, "pitch": 0.0, "yaw": 0.0 if is_wrong else now()} | (angles(now()) if is_wrong else {})),
         )
-        if problem := plausible.problem(sample):
+        if problem := plausible.check(sample):
             raise AttitudeError(problem)
         return sample
 
@@ -282,3 +281,37 @@ def test_a_fault_comes_at_a_time_that_one_can_wait_for(after_s: float) -> None:
     """Catches a traceback of the clock."""
     with pytest.raises(ConfigurationError, match="--fault-after-s must be from 0 to 86400 s"):
         emulate(EmulatorConfig(), Console(quiet=True), {"hot": True}, after_s)
+
+
+BOUNDS = ("ge", "gt", "le", "lt")
+
+
+def documented() -> dict[str, tuple[str, float, float, float]]:
+    """Unit, default and bounds of each number, as docs/hardware.md has them."""
+    rows = [line.strip("| ").split(" | ") for line in Path("docs/hardware.md").read_text().splitlines()]
+    numbers = [row for row in rows if len(row) == 6 and row[0].startswith("`")]
+    return {row[0].strip("`"): (row[1], *map(_number, row[2:5])) for row in numbers}
+
+
+def _number(text: str) -> float:
+    factor = math.pi if text.endswith("π") else 1.0
+    return factor * float({"": "1", "-": "-1"}.get(text.removesuffix("π"), text.removesuffix("π")))
+
+
+def in_code(model: type[Model], prefix: str = "") -> dict[str, tuple[str, float, float, float]]:
+    """The same of a model's fields."""
+    found = {}
+    for name, info in model.model_fields.items():
+        if isinstance(info.json_schema_extra, dict):
+            low, high = (getattr(bound, kind) for bound in info.metadata for kind in BOUNDS if hasattr(bound, kind))
+            found[prefix + name] = (str(info.json_schema_extra["unit"]), info.default, low, high)
+    return found
+
+
+def test_the_table_of_the_docs_has_the_bounds_of_the_code() -> None:
+    """Catches a bound, a unit or a default that is changed in one of the two places, and a setting without any."""
+    expected = in_code(HardwareSettings) | in_code(SafetyLimits, "limits.")
+    assert documented().keys() == expected.keys()
+    for name, (unit, *numbers) in documented().items():
+        assert unit == expected[name][0]
+        assert numbers == pytest.approx(expected[name][1:])

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.packets import Packet, Parser
+from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.faults import Faults, damage
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.servo import EmulatedServo, MotorAtRest
-from elastic_env.hardware.emulator.wire import EmulatedBus
-from elastic_env.hardware.servo_bus import protocol
-from elastic_env.hardware.servo_bus.control_table import servo_model
-from elastic_env.hardware.servo_bus.protocol import Packet, Parser
+from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
 from elastic_env.motion.trajectory import quintic
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.runtime.scenario import make_scenario
@@ -29,18 +28,18 @@ def write(servo: EmulatedServo, name: str, value: int) -> int:
 def read(servo: EmulatedServo, name: str) -> int:
     register = servo.model.table[name]
     error, data = servo.read(register.address, register.size)
-    assert error & ~protocol.ALERT == 0
+    assert error & ~packets.ALERT == 0
     return register.decode(data)
 
 
 def test_registers_keep_their_rights() -> None:
     """Catches a servo that lets itself be written where the real one refuses."""
     servo = make_servo()
-    assert write(servo, "present_position", 5) == protocol.ACCESS_ERROR
-    assert write(servo, "goal_position", 300_000) == protocol.LIMIT_ERROR
-    assert write(servo, "torque_enable", 2) == protocol.RANGE_ERROR
-    assert servo.write(596, b"\x01\x02") == protocol.LENGTH_ERROR
-    assert servo.write(597, b"\x01\x02\x03\x04") == protocol.ACCESS_ERROR
+    assert write(servo, "present_position", 5) == packets.ACCESS_ERROR
+    assert write(servo, "goal_position", 300_000) == packets.LIMIT_ERROR
+    assert write(servo, "torque_enable", 2) == packets.RANGE_ERROR
+    assert servo.write(596, b"\x01\x02") == packets.LENGTH_ERROR
+    assert servo.write(597, b"\x01\x02\x03\x04") == packets.ACCESS_ERROR
     assert write(servo, "goal_position", -131_073) == 0
     assert read(servo, "goal_position") == -131_073
 
@@ -50,13 +49,13 @@ def test_eeprom_is_locked_while_torque_is_on() -> None:
     servo = make_servo()
     assert write(servo, "max_position_limit", 100_000) == 0
     assert write(servo, "torque_enable", 1) == 0
-    assert write(servo, "max_position_limit", 200_000) == protocol.ACCESS_ERROR
+    assert write(servo, "max_position_limit", 200_000) == packets.ACCESS_ERROR
     assert read(servo, "max_position_limit") == 100_000
 
 
 def test_a_servo_that_gets_torque_keeps_its_goal() -> None:
     """Catches an emulator that forgives a program which switches torque on before it has set the goal."""
-    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motor=MotorAtRest(position=0.25))
+    servo = EmulatedServo(1, servo_model(54024), lambda *_: None, motor=Motor(position=0.25))
     write(servo, "goal_position", 1000)
     write(servo, "torque_enable", 1)
     assert read(servo, "goal_position") == 1000
@@ -69,9 +68,9 @@ def test_overload_lets_go_and_raises_the_alert_bit_with_every_reply() -> None:
     servo.overload(True)
     assert not servo.is_on
     error, data = servo.read(611, 4)
-    assert error == protocol.ALERT
+    assert error == packets.ALERT
     assert len(data) == 4
-    assert write(servo, "torque_enable", 1) == protocol.ALERT | protocol.RESULT_FAIL
+    assert write(servo, "torque_enable", 1) == packets.ALERT | packets.RESULT_FAIL
 
 
 def test_watchdog_stops_models_that_have_one() -> None:
@@ -89,7 +88,7 @@ def test_watchdog_stops_models_that_have_one() -> None:
     servo.watch(10.07)
     assert servo.is_on
     assert (read(servo, "goal_position"), read(servo, "bus_watchdog")) == (0, -1)
-    assert write(servo, "goal_position", 5000) == protocol.RANGE_ERROR
+    assert write(servo, "goal_position", 5000) == packets.RANGE_ERROR
     write(servo, "bus_watchdog", 0)
     assert write(servo, "goal_position", 5000) == 0
     old = make_servo(54024)
@@ -109,13 +108,13 @@ def test_sync_and_bulk_instructions_reach_their_servos_in_order() -> None:
     bus = EmulatedBus([make_servo(servo_id=i) for i in (1, 2, 3)])
     values = {1: -131_073, 3: 77}
     data = b"".join(bytes([i]) + v.to_bytes(4, "little", signed=True) for i, v in values.items())
-    assert answers(bus, protocol.packet(0xFE, protocol.SYNC_WRITE, bytes([0x54, 2, 4, 0]) + data)) == []
-    replies = answers(bus, protocol.packet(0xFE, protocol.SYNC_READ, bytes([0x54, 2, 4, 0, 3, 1, 2])))
+    assert answers(bus, packets.packet(0xFE, packets.SYNC_WRITE, bytes([0x54, 2, 4, 0]) + data)) == []
+    replies = answers(bus, packets.packet(0xFE, packets.SYNC_READ, bytes([0x54, 2, 4, 0, 3, 1, 2])))
     assert [r.servo_id for r in replies] == [3, 1, 2]
     assert [int.from_bytes(r.parameters[1:], "little", signed=True) for r in replies] == [77, -131_073, 0]
     bulk = bytes([2, 0x54, 2, 4, 0, 9, 0, 0, 0, 1, 0x32, 2, 1, 0, 1])
-    answers(bus, protocol.packet(0xFE, protocol.BULK_WRITE, bulk))
-    replies = answers(bus, protocol.packet(0xFE, protocol.BULK_READ, bytes([2, 0x54, 2, 4, 0, 1, 0x32, 2, 1, 0])))
+    answers(bus, packets.packet(0xFE, packets.BULK_WRITE, bulk))
+    replies = answers(bus, packets.packet(0xFE, packets.BULK_READ, bytes([2, 0x54, 2, 4, 0, 1, 0x32, 2, 1, 0])))
     assert [r.parameters[1:] for r in replies] == [b"\x09\x00\x00\x00", b"\x01"]
 
 
@@ -123,28 +122,28 @@ def test_fast_reply_is_one_packet_with_a_part_of_every_servo() -> None:
     """Catches parts without their checksums: each ends with one of everything before it."""
     bus = EmulatedBus([make_servo(servo_id=i) for i in (1, 2)])
     (wire,) = bus.answer(
-        Parser().feed(protocol.packet(0xFE, protocol.FAST_SYNC_READ, bytes([0x71, 2, 1, 0, 1, 2])))[0], 0.0
+        Parser().feed(packets.packet(0xFE, packets.FAST_SYNC_READ, bytes([0x71, 2, 1, 0, 1, 2])))[0], 0.0
     )
     assert wire[:8] == bytes.fromhex("FFFFFD00FE0B0055")
     assert wire[8:11] == bytes([0, 1, 35])
     assert wire[13:16] == bytes([0, 2, 35])
-    assert protocol.crc16(wire[:11]) == int.from_bytes(wire[11:13], "little")
-    assert protocol.crc16(wire[:16]) == int.from_bytes(wire[16:], "little")
+    assert packets.crc16(wire[:11]) == int.from_bytes(wire[11:13], "little")
+    assert packets.crc16(wire[:16]) == int.from_bytes(wire[16:], "little")
 
 
 def test_damaged_instruction_is_answered_with_an_error_and_not_obeyed() -> None:
     """Catches a servo that moves on a packet whose checksum is wrong."""
     servo = make_servo()
-    wire = bytearray(protocol.packet(1, protocol.WRITE, bytes([0x32, 2, 1])))
+    wire = bytearray(packets.packet(1, packets.WRITE, bytes([0x32, 2, 1])))
     wire[10] ^= 0x02
     (reply,) = answers(EmulatedBus([servo]), bytes(wire))
-    assert reply.parameters[0] == protocol.CRC_ERROR
+    assert reply.parameters[0] == packets.CRC_ERROR
     assert not servo.is_on
 
 
 def test_faults_come_as_often_as_they_are_asked_for() -> None:
     """Catches a switch that does nothing, or that damages what it should leave alone."""
-    generator, reply = np.random.default_rng(0), protocol.status(1, 0, b"\x01\x02\x03\x04")
+    generator, reply = np.random.default_rng(0), packets.status(1, 0, b"\x01\x02\x03\x04")
     half = [damage(Faults(lost=0.5), reply, generator)[0] for _ in range(400)]
     assert 150 < half.count(b"") < 250
     assert all(damage(Faults(), reply, generator) == (reply, 0.0) for _ in range(20))

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from elastic_env.hardware.emulator.running import RunningEmulator
-from elastic_env.hardware.imu.attitude import AttitudeStream
-from elastic_env.hardware.safety.child_process import child_command, child_environment
-from elastic_env.hardware.safety.supervised import SupervisedBus
+from elastic_env.hardware.emulator.launch import RunningEmulator
+from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.safety.processes import child_command, child_environment
+from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from tests.busy import once_more
 
 PLANTED = (
@@ -71,7 +71,7 @@ def test_packages_of_the_users_path_are_found(tmp_path: Path, monkeypatch: pytes
     for given in (tmp_path / "packages", "packages"):
         monkeypatch.setenv("PYTHONPATH", f"{given}{os.pathsep}.")
         done = subprocess.run(
-            child_command("elastic_env.hardware.servo_bus.port"), env=child_environment(), capture_output=True,
+            child_command("elastic_env.hardware.buses.port"), env=child_environment(), capture_output=True,
             text=True, timeout=60, check=False,
         )  # fmt: skip
         assert "from the path" in done.stderr

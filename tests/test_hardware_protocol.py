@@ -10,44 +10,50 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.emulator.mip import attitude_packet, checksum
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.servo_models import (
+    NUM_BLOCKS,
+    current_of_torque,
+    explain_errors,
+    servo_model,
+    servo_models,
+    torque_of_current,
+)
+from elastic_env.hardware.emulator.imu import attitude_packet, checksum
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.safety.limits import SafetyLimits
-from elastic_env.hardware.servo_bus import protocol
-from elastic_env.hardware.servo_bus.bus import Bus
-from elastic_env.hardware.servo_bus.control_table import NUM_BLOCKS, explain_errors, servo_model, servo_models
-from elastic_env.hardware.servo_bus.torque_line import current_of_torque, torque_of_current
+from elastic_env.hardware.settings import SafetyLimits
 
 # of the ROBOTIS e-manual, Protocol 2.0: instruction or status, and the bytes on the wire
 EXAMPLES = [
-    ((1, protocol.PING, b""), "FF FF FD 00 01 03 00 01 19 4E"),
-    ((1, protocol.STATUS, bytes([0, 6, 4, 0x26])), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
-    ((1, protocol.READ, bytes([0x84, 0, 4, 0])), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
-    ((1, protocol.WRITE, bytes([0x74, 0, 0, 2, 0, 0])), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
-    ((254, protocol.SYNC_READ, bytes([0x84, 0, 4, 0, 1, 2])), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
-    ((1, protocol.REBOOT, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
+    ((1, packets.PING, b""), "FF FF FD 00 01 03 00 01 19 4E"),
+    ((1, packets.STATUS, bytes([0, 6, 4, 0x26])), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
+    ((1, packets.READ, bytes([0x84, 0, 4, 0])), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
+    ((1, packets.WRITE, bytes([0x74, 0, 0, 2, 0, 0])), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
+    ((254, packets.SYNC_READ, bytes([0x84, 0, 4, 0, 1, 2])), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
+    ((1, packets.REBOOT, b""), "FF FF FD 00 01 03 00 08 2F 4E"),
 ]
 
 
 @pytest.mark.parametrize(("content", "wire"), EXAMPLES)
 def test_packets_are_those_of_the_makers_examples(content: tuple[int, int, bytes], wire: str) -> None:
     """Catches a wrong checksum, byte order or length in what both our ends would agree on."""
-    assert protocol.packet(*content) == bytes.fromhex(wire)
-    found = protocol.Parser().feed(bytes.fromhex(wire))
+    assert packets.packet(*content) == bytes.fromhex(wire)
+    found = packets.Parser().feed(bytes.fromhex(wire))
     assert [(p.servo_id, p.instruction, p.parameters, p.is_intact) for p in found] == [(*content, True)]
 
 
 @given(st.binary(max_size=60))
 def test_checksum_is_the_sdks(data: bytes) -> None:
     """Catches a table of ours that differs from the SDK's in a single entry."""
-    assert protocol.crc16(data) == Protocol2PacketHandler().updateCRC(0, list(data), len(data))
+    assert packets.crc16(data) == Protocol2PacketHandler().updateCRC(0, list(data), len(data))
 
 
 @given(st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55]), max_size=30).map(bytes))
 def test_stuffed_bytes_hold_no_header_and_come_back(data: bytes) -> None:
     """Catches a header that survives stuffing, and stuffing that takes a byte of the data away."""
-    assert protocol.stuff(data).replace(b"\xff\xff\xfd\xfd", b"").find(b"\xff\xff\xfd") < 0
-    assert protocol.unstuff(protocol.stuff(data)) == data
+    assert packets.stuff(data).replace(b"\xff\xff\xfd\xfd", b"").find(b"\xff\xff\xfd") < 0
+    assert packets.unstuff(packets.stuff(data)) == data
 
 
 @given(
@@ -56,8 +62,8 @@ def test_stuffed_bytes_hold_no_header_and_come_back(data: bytes) -> None:
 )
 def test_parser_finds_packets_in_pieces_behind_noise(bodies: list[bytes], pieces: list[int]) -> None:
     """Catches a parser that needs whole packets at a time, or that loses step by what lies before the first."""
-    stream = b"\xff\xff\x00\xfd" + b"".join(protocol.status(7, 0, body) for body in bodies)
-    parser, found, at = protocol.Parser(), [], 0
+    stream = b"\xff\xff\x00\xfd" + b"".join(packets.status(7, 0, body) for body in bodies)
+    parser, found, at = packets.Parser(), [], 0
     for number in range(len(stream)):
         step = pieces[number % len(pieces)]
         found += parser.feed(stream[at : at + step])
@@ -67,21 +73,21 @@ def test_parser_finds_packets_in_pieces_behind_noise(bodies: list[bytes], pieces
 
 def test_parser_gives_a_damaged_packet_as_damaged_and_goes_on() -> None:
     """Catches a flipped bit that is taken for data, and a lost tail that swallows the next packet."""
-    good = protocol.status(1, 0, b"\x01\x02\x03\x04")
+    good = packets.status(1, 0, b"\x01\x02\x03\x04")
     flipped = bytearray(good)
     flipped[10] ^= 1
-    assert [p.is_intact for p in protocol.Parser().feed(bytes(flipped) + good)] == [False, True]
+    assert [p.is_intact for p in packets.Parser().feed(bytes(flipped) + good)] == [False, True]
     for end in range(4, len(good)):
-        found = [p.parameters for p in protocol.Parser().feed(good[:end] + good) if p.is_intact]
+        found = [p.parameters for p in packets.Parser().feed(good[:end] + good) if p.is_intact]
         assert found == [b"\x00\x01\x02\x03\x04"]
 
 
 def test_a_checksum_that_completes_a_header_is_no_header() -> None:
     """Catches a packet that is dropped for the header in its end: goal −26843 to id 1 ends FF FF, its CRC FD 00."""
     goal = bytes([0x54, 2, 4, 0, 1]) + (-26_843).to_bytes(4, "little", signed=True)
-    wire = protocol.packet(protocol.BROADCAST, protocol.SYNC_WRITE, goal)
-    assert wire.endswith(protocol.HEADER)
-    parser = protocol.Parser()
+    wire = packets.packet(packets.BROADCAST, packets.SYNC_WRITE, goal)
+    assert wire.endswith(packets.HEADER)
+    parser = packets.Parser()
     found = [packet for byte in wire + wire for packet in parser.feed(bytes([byte]))]
     assert [(p.parameters, p.is_intact) for p in found] == [(goal, True)] * 2
 
@@ -125,13 +131,13 @@ def test_a_late_reply_is_never_taken_for_another_requests(lateness: list[float])
     position = model.table["present_position"]
     on_the_way: dict[float, list[bytes]] = {}
 
-    class Line(Bus):
+    class Line(DynamixelBus):
         """A bus whose servo answers a request so many requests later."""
 
         requests = 0
 
         def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
-            assert (servo_id, instruction) == (protocol.BROADCAST, protocol.SYNC_READ)
+            assert (servo_id, instruction) == (packets.BROADCAST, packets.SYNC_READ)
             start, length = (int.from_bytes(parameters[i : i + 2], "little") for i in (0, 2))
             reply = bytearray(length)
             at = position.address - start

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.emulator.launch import RunningEmulator
 from elastic_env.hardware.errors import FaultError
 from elastic_env.hardware.safety import realtime
-from elastic_env.hardware.safety.limits import SafetyLimits
 from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
-from elastic_env.hardware.safety.supervised import SupervisedBus
+from elastic_env.hardware.safety.supervised_bus import SupervisedBus
+from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
 
 BUSY_S = 0.5

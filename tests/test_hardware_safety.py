@@ -14,15 +14,16 @@ import numpy as np
 import pytest
 
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.emulator.config import EmulatorConfig
-from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.buses.bus import States
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.port import Port
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
-from elastic_env.hardware.imu.attitude import AttitudeStream
+from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import check_bus
-from elastic_env.hardware.safety.limits import Guard, SafetyLimits
-from elastic_env.hardware.safety.supervised import SupervisedBus
-from elastic_env.hardware.servo_bus.bus import Bus, Buses, States
-from elastic_env.hardware.servo_bus.port import Port
+from elastic_env.hardware.safety.guard import Guard
+from elastic_env.hardware.safety.supervised_bus import SupervisedBus
+from elastic_env.hardware.settings import SafetyLimits
 from tests.busy import once_more
 
 PERIOD_S = 0.004
@@ -73,14 +74,14 @@ def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> N
     """Catches commands that go on blindly, a fault at the first hiccup, and a count that a good reply does not end."""
     guard = Guard(SafetyLimits(slew_rad_s=1.0), np.zeros(1), ["it"])
     guard.command(np.array([1.0]), 0.004)
-    assert guard.take(states([0.0], fresh=False)) == ""
+    assert guard.check(states([0.0], fresh=False)) == ""
     held, is_limited = guard.command(np.array([1.0]), 0.004)
     assert held.tolist() == [0.004]
     assert is_limited.all()
-    assert guard.take(states([0.0], fresh=False)) == ""
-    assert guard.take(states([0.0])) == ""
+    assert guard.check(states([0.0], fresh=False)) == ""
+    assert guard.check(states([0.0])) == ""
     assert guard.command(np.array([1.0]), 0.004)[0].tolist() == [0.008]
-    reasons = [guard.take(states([0.0], fresh=False)) for _ in range(3)]
+    reasons = [guard.check(states([0.0], fresh=False)) for _ in range(3)]
     assert reasons[:2] == ["", ""]
     assert "no usable reply from it in 3 cycles" in reasons[2]
 
@@ -95,14 +96,14 @@ def test_a_missing_reply_holds_the_command_and_the_third_stops_the_motion() -> N
 )
 def test_what_is_measured_stops_the_motion(measured: States, words: str) -> None:
     """Catches a limit that is never looked at."""
-    assert words in Guard(SafetyLimits(), np.zeros(1), ["it"]).take(measured)
+    assert words in Guard(SafetyLimits(), np.zeros(1), ["it"]).check(measured)
 
 
 def test_too_much_torque_stops_the_motion_when_it_lasts() -> None:
     """Catches a stop at one spike of the current, and none under a load that stays."""
     guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
     strained = states([0.0], current=-12.0)
-    assert [guard.take(s) != "" for s in (strained, strained, states([0.0]), strained, strained, strained)] == [
+    assert [guard.check(s) != "" for s in (strained, strained, states([0.0]), strained, strained, strained)] == [
         False, False, False, False, False, True,
     ]  # fmt: skip
 
@@ -111,7 +112,7 @@ def test_missing_replies_do_not_hide_too_much_torque() -> None:
     """Catches a load that lasts for ever because every second reply is lost."""
     guard = Guard(SafetyLimits(torque_nm=40.0), np.zeros(1), ["it"])
     strained, missing = states([0.0], current=-12.0), states([np.nan], current=np.nan, fresh=False)
-    reasons = [guard.take(s) for s in (strained, missing, strained, missing, strained)]
+    reasons = [guard.check(s) for s in (strained, missing, strained, missing, strained)]
     assert reasons[:4] == [""] * 4
     assert "torque exceeds 40 N·m: it: " in reasons[4]
 
@@ -153,7 +154,7 @@ def torque_events(emulator: RunningEmulator, value: int) -> list[float]:
 
 def test_registers_and_positions_that_look_like_a_header_pass_both_ways(emulator: RunningEmulator) -> None:
     """Catches the SDK's missing stuffing: −131073 is FF FF FD FF on the wire."""
-    with Bus(emulator.port) as bus:
+    with DynamixelBus(emulator.port) as bus:
         assert [(f.servo_id, f.model_number) for f in (bus.ping(1), bus.ping(2))] == [(1, 54024), (2, 54024)]
         bus.attach([1, 2])
         for value in (-131_073, -131_072, -3, 250_961):
@@ -168,7 +169,7 @@ def test_registers_and_positions_that_look_like_a_header_pass_both_ways(emulator
 
 def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -> None:
     """Catches a check that reads the wrong register: the emulated servos are set as they should be."""
-    with Bus(emulator.port) as bus:
+    with DynamixelBus(emulator.port) as bus:
         checks = check_bus(bus, [1, 2])
     of_the_computer = ("round trip of a ping", "lost replies")  # pseudo-terminals are slow where it is busy
     assert [one.what for one in checks if not one.is_good and one.what not in of_the_computer] == []
@@ -177,7 +178,7 @@ def test_check_finds_nothing_wrong_with_good_servos(emulator: RunningEmulator) -
 
 def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
     """Catches emulated servos that are delivered with settings that nothing but the maker's program can change."""
-    with RunningEmulator(EmulatorConfig(model_number=2020)) as newer, Bus(newer.port) as bus:
+    with RunningEmulator(EmulatorConfig(model_number=2020)) as newer, DynamixelBus(newer.port) as bus:
         found = {one.what: one.cure for one in check_bus(bus, [1]) if one.what.startswith("1: ")}
     assert set(found.values()) == {""}
 
@@ -185,7 +186,7 @@ def test_check_finds_nothing_wrong_with_the_newer_servos() -> None:
 @pytest.mark.parametrize("fault", ["lost", "corrupted"])
 def test_a_bad_line_is_seen_by_its_lost_and_damaged_replies(fault: str) -> None:
     """Catches a check that calls a line fine whose replies come at the second try."""
-    with RunningEmulator(EmulatorConfig(seed=5)) as emulator, Bus(emulator.port) as bus:
+    with RunningEmulator(EmulatorConfig(seed=5)) as emulator, DynamixelBus(emulator.port) as bus:
         bus.attach([1])
         emulator.faults(**{fault: 0.1})  # from here on the same replies every time
         found = {one.what: one for one in check_bus(bus, [1])}
@@ -234,7 +235,7 @@ def test_a_read_takes_no_more_than_it_asked_for_and_loses_nothing() -> None:
 
 def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator) -> None:
     """Catches the SDK's habit of giving the answer of the last request to this one."""
-    with Bus(emulator.port) as bus:
+    with DynamixelBus(emulator.port) as bus:
         bus.attach([1])
         emulator.faults(late=1.0, late_s=0.006)
         missing = 0
@@ -251,7 +252,7 @@ def test_late_replies_are_not_taken_for_the_next_ones(emulator: RunningEmulator)
 
 def test_second_program_is_told_which_port_is_taken(emulator: RunningEmulator, supervised: SupervisedBus) -> None:
     """Catches two programs on one bus, one directly and one through a supervisor."""
-    for intrude in (lambda: Bus(emulator.port).open(), lambda: SupervisedBus({emulator.port: [1]})):
+    for intrude in (lambda: DynamixelBus(emulator.port).open(), lambda: SupervisedBus({emulator.port: [1]})):
         with pytest.raises(PortError, match=emulator.port):
             intrude()
     assert supervised.read().is_fresh.all()
@@ -341,7 +342,7 @@ def test_a_supervisor_that_waits_for_silent_servos_is_not_taken_for_dead(
 
 def test_instructions_that_are_lost_reach_no_servo(emulator: RunningEmulator) -> None:
     """Catches a switch that loses replies only: the servo would have done what it was told."""
-    with Bus(emulator.port) as bus:
+    with DynamixelBus(emulator.port) as bus:
         bus.attach([1, 2])
         emulator.events()
         emulator.faults(unheard=1.0)
@@ -387,7 +388,7 @@ def _wait_until_free(port: str) -> None:
     deadline = time.monotonic() + 3.0
     while time.monotonic() < deadline:
         try:
-            with Bus(port):
+            with DynamixelBus(port):
                 return
         except PortError:
             time.sleep(0.01)
@@ -412,7 +413,10 @@ def test_two_buses_are_read_side_by_side(emulator: RunningEmulator) -> None:
 def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
     """Catches registers of one model written to another."""
     with RunningEmulator(EmulatorConfig(claimed_model_number=1020)) as strange:
-        with Bus(strange.port) as bus, pytest.raises(HardwareError, match="no control table for model number 1020"):
+        with (
+            DynamixelBus(strange.port) as bus,
+            pytest.raises(HardwareError, match="no control table for model number 1020"),
+        ):
             bus.attach([1])
         assert strange.events() == []
 
@@ -420,6 +424,6 @@ def test_wrong_model_number_is_refused_before_anything_is_written() -> None:
 def test_no_port_says_what_there_is() -> None:
     """Catches a traceback of the serial library."""
     with pytest.raises(PortError, match="no such device"):
-        Buses([Bus("/dev/ttyNOTHING")]).buses[0].open()
+        DynamixelBus("/dev/ttyNOTHING").open()
     with pytest.raises(PortError, match="57600"):
-        Bus("/dev/ttyNOTHING", baudrate=123).open()
+        DynamixelBus("/dev/ttyNOTHING", baudrate=123).open()

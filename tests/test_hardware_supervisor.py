@@ -15,19 +15,17 @@ from typing import Any
 
 import pytest
 
-from elastic_env.hardware.emulator.servo import EmulatedServo, MotorAtRest
-from elastic_env.hardware.emulator.wire import EmulatedBus
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.packets import Packet, Parser
+from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
 from elastic_env.hardware.errors import BusGoneError, ReplyError
-from elastic_env.hardware.safety import supervised, supervisor
-from elastic_env.hardware.safety.channel import Channel
-from elastic_env.hardware.safety.ending import is_ending
-from elastic_env.hardware.safety.limits import SafetyLimits
-from elastic_env.hardware.safety.supervised import emergency_stop
+from elastic_env.hardware.safety import supervised_bus, supervisor
+from elastic_env.hardware.safety.processes import Channel, is_ending
+from elastic_env.hardware.safety.supervised_bus import emergency_stop
 from elastic_env.hardware.safety.supervisor import Supervisor
-from elastic_env.hardware.servo_bus import protocol
-from elastic_env.hardware.servo_bus.bus import Bus
-from elastic_env.hardware.servo_bus.control_table import servo_model
-from elastic_env.hardware.servo_bus.protocol import Packet, Parser
+from elastic_env.hardware.settings import SafetyLimits
 
 MODEL = servo_model(54024)
 ENABLE = ("enable", {"limits": SafetyLimits().model_dump()})
@@ -38,7 +36,7 @@ def exchange(*goals: float) -> tuple[str, dict[str, Any]]:
     return "exchange", {"goals": list(goals), "at": 0.0}
 
 
-class Line(Bus):
+class Line(DynamixelBus):
     """A bus whose servos answer at once.
 
     Attributes:
@@ -53,7 +51,7 @@ class Line(Bus):
 
     def __init__(self, name: str, *ids: int, log: list[tuple[str, int]] | None = None, number: int = 54024) -> None:
         super().__init__(name)
-        self.motors = {servo_id: MotorAtRest() for servo_id in ids}
+        self.motors = {servo_id: Motor() for servo_id in ids}
         self.servos = {
             i: EmulatedServo(i, servo_model(number), self._note, None, motor) for i, motor in self.motors.items()
         }
@@ -158,7 +156,7 @@ def test_signals_in_the_last_moment_do_not_keep_torque_on(number: int) -> None:
 def test_a_bus_that_is_lost_before_the_first_step_is_remembered() -> None:
     """Catches "torque is off" as the answer where nobody knows: the first to hear of the loss was the keeper."""
     line = attached("one", 1)
-    line.gone_at = protocol.SYNC_READ
+    line.gone_at = packets.SYNC_READ
     answers = served([line], ENABLE, exchange(0.0), exchange(0.0), ENABLE, ("disable", {}))
     assert [answer.get("error", "") for answer in answers] == ["", *["BusGoneError"] * 4]
     assert all(answer["message"].count("the bus at one is gone") == 1 for answer in answers[1:])
@@ -167,15 +165,15 @@ def test_a_bus_that_is_lost_before_the_first_step_is_remembered() -> None:
 def test_a_lost_bus_leaves_the_others_off_and_confirmed() -> None:
     """Catches a loss that ends the attempt at the others, and a message that tells of one bus only."""
     lost, left = attached("one", 1), attached("two", 1, 2)
-    lost.gone_at = protocol.SYNC_READ
+    lost.gone_at = packets.SYNC_READ
     _, answer = served([lost, left], ENABLE, exchange(0.0, 0.0, 0.0))
     assert answer["error"] == "BusGoneError"
     said = r"the bus at one is gone \(error \d+\): switch their power off; torque is off at two"
     assert re.fullmatch(said, answer["message"])
     assert [servo.is_on for servo in left.servos.values()] == [False, False]
-    after = left.sent[left.sent.index((protocol.BROADCAST, protocol.SYNC_READ)) + 1 :]
-    off = (protocol.BROADCAST, protocol.SYNC_WRITE)
-    assert after[:4] == [off, off, (1, protocol.READ), (2, protocol.READ)]
+    after = left.sent[left.sent.index((packets.BROADCAST, packets.SYNC_READ)) + 1 :]
+    off = (packets.BROADCAST, packets.SYNC_WRITE)
+    assert after[:4] == [off, off, (1, packets.READ), (2, packets.READ)]
 
 
 def test_no_lost_instruction_lets_a_servo_jump() -> None:
@@ -238,7 +236,7 @@ def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(monkeypat
     """Catches a stop that asks all servos before it switches any off, or one port after the other."""
     log: list[tuple[str, int]] = []
     lines = {"one": attached("one", 1, 2, log=log), "two": attached("two", 3, log=log)}
-    monkeypatch.setattr(supervised, "Bus", lambda port, _: lines[port])
+    monkeypatch.setattr(supervised_bus, "DynamixelBus", lambda port, _: lines[port])
     ports = {"one": [1, 2], "two": [3]}
     for line in lines.values():
         line.write_all("torque_enable", dict.fromkeys(line.ids, 1))
@@ -248,14 +246,14 @@ def test_emergency_stop_does_not_wait_for_a_servo_that_does_not_answer(monkeypat
     assert not any(servo.is_on for line in lines.values() for servo in line.servos.values())
     assert "not confirmed by servo 2 at one: switch the power off" in said
     assert "torque is off at two" in said
-    assert {instruction for _, instruction in log[:4]} == {protocol.SYNC_WRITE}
+    assert {instruction for _, instruction in log[:4]} == {packets.SYNC_WRITE}
     assert sorted(name for name, _ in log[:4]) == ["one", "one", "two", "two"]
 
 
 def test_emergency_stop_without_models_takes_those_that_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches one servo without power that keeps all others under torque."""
     line = attached("one", 1, 2)
-    monkeypatch.setattr(supervised, "Bus", lambda *_: line)
+    monkeypatch.setattr(supervised_bus, "DynamixelBus", lambda *_: line)
     line.write_all("torque_enable", {1: 1, 2: 1})
     line.silent = {1}
     said = emergency_stop({"one": [1, 2]})

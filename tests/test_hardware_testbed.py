@@ -21,23 +21,22 @@ import pytest
 
 import baselines
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.hardware.emulator.config import EmulatorConfig
-from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.buses.bus import States
+from elastic_env.hardware.buses.servo_models import torque_of_current
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import HardwareError, PortError
-from elastic_env.hardware.imu.attitude import Attitude, AttitudeError, AttitudeStream, SharedSample, link_angle
+from elastic_env.hardware.imu import Attitude, AttitudeError, AttitudeStream, SharedSample
+from elastic_env.hardware.live import plant
 from elastic_env.hardware.safety import realtime
-from elastic_env.hardware.safety.supervised import Cycle
-from elastic_env.hardware.servo_bus.bus import States
-from elastic_env.hardware.servo_bus.torque_line import torque_of_current
-from elastic_env.hardware.testbed import plant
-from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.hardware.safety.supervised_bus import Cycle
+from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from tests.busy import once_more
 from tests.hardware_trials import trials as hardware_trials
 from tests.hardware_trials.__main__ import prove
 from train.commands.cli import main
 from train.experiments.identify import IdentifyConfig, identified_environments
-from train.hardware.session import hardware_arguments
+from train.hardware import hardware_arguments
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
 PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
@@ -316,9 +315,9 @@ def test_mounting_turns_angles_into_the_joints() -> None:
     assert mounting.servo_angle(0.2) == pytest.approx(0.3)
     limits = mounting.servo_limits
     assert (limits.lowest_rad, limits.highest_rad) == pytest.approx((0.2, 1.5))
-    assert link_angle(Attitude(0.0, 0.1, -0.2, 0.0), "pitch", -1, -0.2) == 0.0
-    assert link_angle(Attitude(0.0, 0.1, -0.2, 0.0), "pitch", -1, 0.05) == pytest.approx(0.25)
-    assert link_angle(Attitude(0.0, 3.0, 0.0, 0.0), "roll", 1, -0.5) == pytest.approx(3.5 - 2 * np.pi)
+    assert Attitude(0.0, 0.1, -0.2, 0.0).link_angle("pitch", -1, -0.2) == 0.0
+    assert Attitude(0.0, 0.1, -0.2, 0.0).link_angle("pitch", -1, 0.05) == pytest.approx(0.25)
+    assert Attitude(0.0, 3.0, 0.0, 0.0).link_angle("roll", 1, -0.5) == pytest.approx(3.5 - 2 * np.pi)
 
 
 def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What can go wrong with hardware; every message names the port and says what to do."""
+"""Errors of hardware. Every message names the port and says what to do."""
 
 from elastic_env.core.errors import SystemFailedError
 
@@ -16,7 +16,10 @@ class ReplyError(HardwareError):
 
 
 class BusGoneError(HardwareError):
-    """The port is gone: unplugged, or its driver failed. Nothing can be commanded any more, torque off neither."""
+    """The port is gone: unplugged, or its driver failed.
+
+    Nothing can be commanded any more, torque off neither.
+    """
 
 
 class FaultError(HardwareError):

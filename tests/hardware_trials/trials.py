@@ -18,19 +18,19 @@ import numpy as np
 
 import elastic_env  # noqa: F401  registers the environments
 from baselines.identification.identify import identify
-from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.buses.bus import States
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.servo_models import servo_model
 from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.running import RunningEmulator
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
 from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError
-from elastic_env.hardware.safety.child_process import child_command, child_environment
-from elastic_env.hardware.safety.limits import SafetyLimits
+from elastic_env.hardware.safety.processes import child_command, child_environment
 from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime, sleep_until
-from elastic_env.hardware.safety.supervised import SupervisedBus
-from elastic_env.hardware.servo_bus.bus import Bus, States
-from elastic_env.hardware.servo_bus.control_table import servo_model
+from elastic_env.hardware.safety.supervised_bus import SupervisedBus
+from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
 from tests.hardware_trials.wave import PERIOD_S, goal
-from train.hardware.session import PATIENT_LIMITS
+from train.hardware import PATIENT_LIMITS
 
 _USB_LATENCY = Faults(latency_s=1e-3)
 _TORQUE_OFF_S = 0.1
@@ -435,7 +435,7 @@ def _wait_until_free(port: str) -> None:
     """Wait until the supervisor of a program that has ended has given the port back."""
     deadline = time.monotonic() + 5.0
     while time.monotonic() < deadline:
-        with contextlib.suppress(PortError), Bus(port):
+        with contextlib.suppress(PortError), DynamixelBus(port):
             return
         time.sleep(0.005)
 
@@ -482,7 +482,7 @@ def header_positions(share: float) -> Trial:
     for number in (54024, 54025, 2020):
         with (
             RunningEmulator(EmulatorConfig(model_number=number, ids=(1, 2, 0xFC))) as emulator,
-            Bus(emulator.port) as bus,
+            DynamixelBus(emulator.port) as bus,
         ):
             bus.attach([1, 2, 0xFC])
             for value in (-131073, -131072, -131074, -3, -1, -513, 0xFDFF, 0xFFFF, -65537, 131071):

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.safety.supervised import SupervisedBus
+from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 
 PERIOD_S = 0.004
 AMPLITUDE_RAD = 0.3

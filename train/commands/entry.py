@@ -44,7 +44,7 @@ def main() -> None:
 def _leave_working_folder() -> None:
     """Import nothing from the working folder that is installed, here and in the processes that are started."""
     look_last_in(Path.cwd())
-    from elastic_env.hardware.safety.child_process import child_environment
+    from elastic_env.hardware.safety.processes import child_environment
 
     kept = child_environment()
     if "PYTHONPATH" not in kept:

@@ -25,7 +25,7 @@ class Scan:
 
     def run(self) -> None:
         """Scan."""
-        from train.hardware.session import scan
+        from train.hardware import scan
 
         if not scan(self.port, self.baudrate, CONSOLE):
             sys.exit(3)
@@ -51,7 +51,7 @@ class Check:
 
     def run(self) -> None:
         """Check."""
-        from train.hardware.session import check
+        from train.hardware import check
 
         if not check(self.port, self.ids, self.baudrate, self.imu_port, self.imu_baudrate, CONSOLE):
             sys.exit(3)
@@ -76,7 +76,7 @@ class Run:
     def run(self) -> None:
         """Play."""
         from train.evaluate.conditions import PolicySpec
-        from train.hardware.session import run
+        from train.hardware import run
 
         if not (arguments := self.on.arguments):
             raise ConfigurationError("--port is needed; see: elastic hardware scan PORT, elastic hardware emulate")
@@ -123,10 +123,10 @@ class Emulate:
 
     def run(self) -> None:
         """Emulate."""
-        from elastic_env.hardware.emulator.config import EmulatorConfig
         from elastic_env.hardware.emulator.faults import Faults
+        from elastic_env.hardware.emulator.launch import EmulatorConfig
         from elastic_env.robots.testbed.environment import configure_testbed
-        from train.hardware.session import emulate, require_switches
+        from train.hardware import emulate, require_switches
 
         require_switches(self.fault)
         faults = Faults(

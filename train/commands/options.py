@@ -41,7 +41,7 @@ class OnHardware:
         """Arguments of the environment on hardware; empty for the simulation."""
         if self == OnHardware():
             return {}
-        from train.hardware.session import hardware_arguments
+        from train.hardware import hardware_arguments
 
         return hardware_arguments(self.port, self.imu_port, self.mounting, yes=self.yes, patient=self.patient)
 

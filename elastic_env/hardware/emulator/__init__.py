@@ -1,1 +1,1 @@
-"""Servos and IMU without hardware: real protocols on pseudo-terminals, moved by the project's own elastic joint."""
+"""Servos and IMU without hardware: real protocols on pseudo-terminals, our own elastic joint."""

@@ -1,50 +1,49 @@
-"""What can go wrong on a bus, by switch: for trying out what a program does about it."""
-
-import math
+"""Faults of an emulated bus, by switch: for trying out what a program does about them."""
 
 import numpy as np
 
 from elastic_env.core.config import Model, quantity
 
-Angles = tuple[float, float, float]
-
-_NO_ANGLE = 8.0
+_SHARE = {"ge": 0, "le": 1}
 
 
 class Faults(Model):
-    """Faults of an emulated bus; all of them off by default. Shares are drawn per reply, or per instruction."""
+    """Faults of an emulated bus; all of them off by default.
 
-    unheard: float = quantity("1", 0.0, ge=0, le=1, description="share of instructions that reach no servo")
-    lost: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that do not come")
-    late: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that come late")
+    Shares are drawn per reply, or per instruction.
+    """
+
+    unheard: float = quantity("1", 0.0, **_SHARE, description="share of instructions that reach no servo")
+    lost: float = quantity("1", 0.0, **_SHARE, description="share of replies that do not come")
+    late: float = quantity("1", 0.0, **_SHARE, description="share of replies that come late")
     late_s: float = quantity("s", 0.006, ge=0, le=1, description="how late")
-    corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of replies with a flipped bit")
-    truncated: float = quantity("1", 0.0, ge=0, le=1, description="share of replies that end too early")
+    corrupted: float = quantity("1", 0.0, **_SHARE, description="share of replies with a flipped bit")
+    truncated: float = quantity("1", 0.0, **_SHARE, description="share of replies that end too early")
     latency_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of every reply: the adapter's latency timer")
     overload: bool = False
-    """Whether the servos report an overload and let go."""
+    """The servos report an overload and let go."""
     hot: bool = False
-    """Whether the servos are at 95 °C, and report no error."""
+    """The servos are at 95 °C, and report no error."""
     silent: bool = False
-    """Whether the servos hear but do not answer."""
+    """The servos hear but do not answer."""
     unplugged: bool = False
-    """Whether the port is gone."""
+    """The port is gone."""
     imu_silent: bool = False
-    """Whether the IMU sends nothing."""
+    """The IMU sends nothing."""
     imu_late_s: float = quantity("s", 0.0, ge=0, le=1, description="delay of the IMU's packets")
     imu_nan: bool = False
-    """Whether the IMU sends nan for the roll, as valid."""
+    """The IMU sends nan for the roll, as valid."""
     imu_inf: bool = False
-    """Whether it sends an infinite roll, as valid."""
+    """The IMU sends an infinite roll, as valid."""
     imu_out_of_range: bool = False
-    """Whether it sends a roll that no angle has, as valid."""
+    """The IMU sends a roll that no angle has, as valid."""
     imu_frozen: bool = False
-    """Whether its packets go on, with the angles of the last one before."""
-    imu_corrupted: float = quantity("1", 0.0, ge=0, le=1, description="share of IMU packets with a flipped bit")
+    """The IMU's packets go on, with the angles of the last one before."""
+    imu_corrupted: float = quantity("1", 0.0, **_SHARE, description="share of IMU packets with a flipped bit")
 
 
 def damage(faults: Faults, reply: bytes, generator: np.random.Generator) -> tuple[bytes, float]:
-    """What becomes of a reply: its bytes, none if it is lost, and its delay [s]."""
+    """A reply as the line delivers it: its bytes, none if it is lost, and its delay [s]."""
     delay = faults.latency_s
     chance = generator.random(4)
     if faults.silent or chance[0] < faults.lost:
@@ -56,22 +55,6 @@ def damage(faults: Faults, reply: bytes, generator: np.random.Generator) -> tupl
     if chance[3] < faults.truncated:
         reply = reply[: int(generator.integers(1, len(reply)))]
     return reply, delay
-
-
-def distort(faults: Faults, angles: Angles, last: Angles) -> Angles:
-    """Roll, pitch and yaw as a faulty IMU sends them [rad].
-
-    Args:
-        faults: What is wrong with it.
-        angles: What it has measured [rad].
-        last: What it has sent last [rad].
-    """
-    if faults.imu_frozen:
-        return last
-    for is_so, roll in ((faults.imu_nan, math.nan), (faults.imu_inf, math.inf), (faults.imu_out_of_range, _NO_ANGLE)):
-        if is_so:
-            return roll, *angles[1:]
-    return angles
 
 
 def flip_bit(data: bytes, generator: np.random.Generator) -> bytes:

@@ -1,4 +1,4 @@
-"""The emulator's own process: pseudo-terminals in real time, and a line-based channel for faults and events."""
+"""The emulator's own process: pseudo-terminals in real time, a channel for faults and events."""
 
 import contextlib
 import fcntl
@@ -13,134 +13,133 @@ import termios
 import time
 import tty
 from collections import deque
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from elastic_env.hardware.emulator.config import EmulatorConfig
-from elastic_env.hardware.emulator.faults import Angles, damage, distort, flip_bit
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.faults import damage
+from elastic_env.hardware.emulator.imu import EmulatedImu
 from elastic_env.hardware.emulator.joints import Joints
-from elastic_env.hardware.emulator.mip import attitude_packet
-from elastic_env.hardware.emulator.servo import EmulatedServo
-from elastic_env.hardware.emulator.wire import EmulatedBus
+from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
-from elastic_env.hardware.servo_bus import protocol
-from elastic_env.hardware.servo_bus.control_table import servo_model
-from elastic_env.runtime.sensors import attitude
 
-_PHYSICS_S, _LONGEST_PHYSICS_S = 2e-3, 5e-3  # between two advances: as a rule, and while replies go out
-_PACKET_BYTES, _PACKET_S = 62, 1e-3  # a USB adapter passes on as many bytes at once, or what it has after that time
-_SETTLE_S = 3e-4  # after a write, for the kernel to pass it on, which it does at a lower priority than ours
-_UNREAD_BYTES = 2000
+_PHYSICS_S = 2e-3  # between two advances, as a rule
+_LONGEST_PHYSICS_S = 5e-3  # and while replies go out
+_PACKET_BYTES = 62  # a USB adapter passes on as many bytes at once
+_PACKET_S = 1e-3  # or what it has after that time
+_SETTLE_S = 3e-4  # after a write, for the kernel to pass it on at its lower priority
+_WAIT_S = 0.1
 _KEPT_EVENTS = 100_000
-_WOBBLE_RAD = 1e-5
+_UNREAD_BYTES = 2000
 _OUTPUT_SPEED = 5  # in what tcgetattr returns
 
 
-@dataclass
 class Terminal:
-    """A pseudo-terminal; programs open its name as they would a serial port."""
+    """A pseudo-terminal that passes bytes through as they are.
 
-    master: int
-    slave: int
-    name: str
+    Programs open its name as they would a serial port.
+    """
 
-    @staticmethod
-    def opened() -> "Terminal":
-        """A new one, which passes bytes through as they are."""
-        master, slave = pty.openpty()
-        tty.setraw(slave)
-        os.set_blocking(master, False)
-        return Terminal(master, slave, os.ttyname(slave))
+    def __init__(self) -> None:
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self.master, False)
+        self.name = os.ttyname(self._slave)
 
     def write(self, data: bytes) -> None:
-        """Pass bytes on; they are lost where nobody has read what is there, as on a line to nobody."""
-        unread = struct.unpack("i", fcntl.ioctl(self.slave, termios.FIONREAD, b"\0\0\0\0"))[0]
+        """Pass bytes on.
+
+        They are lost where nobody has read what is there, as on a line to nobody.
+        """
+        unread = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, b"\0\0\0\0"))[0]
         if unread > _UNREAD_BYTES:
-            termios.tcflush(self.slave, termios.TCIFLUSH)
+            termios.tcflush(self._slave, termios.TCIFLUSH)
         with contextlib.suppress(OSError):
             os.write(self.master, data)
 
     def read(self) -> bytes:
-        """What has come."""
+        """Bytes that have come."""
         with contextlib.suppress(OSError):
             return os.read(self.master, 4096)
         return b""
 
-    def speaks(self, baudrate: int) -> bool:
-        """Whether the program at the other end has set a baud rate; one that the system has no name for passes."""
-        return termios.tcgetattr(self.slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}")
+    def has_rate(self, baudrate: int) -> bool:
+        """True if the program at the other end has set a baud rate.
+
+        One that the system has no name for passes.
+        """
+        return termios.tcgetattr(self._slave)[_OUTPUT_SPEED] == getattr(termios, f"B{baudrate}")
 
     def close(self) -> None:
         """Take it away, as an unplugged adapter is."""
         os.close(self.master)
-        os.close(self.slave)
+        os.close(self._slave)
 
 
-@dataclass
 class Emulator:
     """Servos, joints and IMU behind two pseudo-terminals.
 
-    Attributes:
+    Args:
         config: What is emulated.
+
+    Attributes:
+        events: When, at which servo, which register became what: torque, goal and watchdog; and
+            which position was asked for.
     """
 
-    config: EmulatorConfig
-    events: deque[tuple[float, int, str, int]] = field(default_factory=lambda: deque(maxlen=_KEPT_EVENTS))
-    """When, at which servo, which register became what: torque, goal and watchdog; and which position was asked for."""
-
-    def __post_init__(self) -> None:
-        config, model = self.config, servo_model(self.config.model_number)
-        self.bus_terminal: Terminal | None = Terminal.opened()
-        self.imu_terminal = Terminal.opened()
+    def __init__(self, config: EmulatorConfig) -> None:
+        now = time.monotonic()
+        model = servo_model(config.model_number)
+        self.config = config
         self.faults = config.faults
-        # of replies, IMU and instructions: who asks for replies gets the same faults, whatever the time
-        self._line, self._imu, self._way, self._wobble = (
-            np.random.default_rng([config.seed, stream]) for stream in range(4)
-        )
-        self._joints = Joints(config.testbed, len(config.ids), time.monotonic())
+        self.events: deque[tuple[float, int, str, int]] = deque(maxlen=_KEPT_EVENTS)
+        self.bus_terminal: Terminal | None = Terminal()
+        self.imu_terminal = Terminal()
+        # each with a stream of its own: who asks for replies gets the same faults, whatever the
+        # time
+        self._reply_faults = np.random.default_rng([config.seed, 0])
+        self._instruction_faults = np.random.default_rng([config.seed, 2])
+        self._joints = Joints(config.testbed, len(config.ids), now)
         self._servos = [
             EmulatedServo(servo_id, model, partial(self._note, index), config.claimed_model_number, motor)
             for index, (servo_id, motor) in enumerate(zip(config.ids, self._joints.motors, strict=True))
         ]
-        self._with_watchdog = self._servos if model.has_watchdog else []
         self._bus = EmulatedBus(self._servos)
-        self._parser = protocol.Parser()
+        self._imu = EmulatedImu(config, now)
+        self._parser = packets.Parser()
         self._replies: deque[tuple[float, bytes]] = deque()
-        self._attitudes: deque[tuple[float, bytes]] = deque()
-        self._angles: Angles = (0.0, 0.0, 0.0)
-        self._next_imu_s = self._start_s = self._settled_s = time.monotonic()
+        self._settled_s = now
 
-    def step(self, wait_s: float, control: int | None = None) -> bool:
-        """Wait for something to happen, and let it; whether the control channel has something to say."""
-        sources = [self.bus_terminal.master] if self.bus_terminal is not None else []
-        ready, _, _ = select.select([*sources, *([] if control is None else [control])], [], [], self._idle(wait_s))
+    def step(self, wait_s: float, control: int) -> bool:
+        """Wait for something to happen, and let it.
+
+        Returns:
+            True if the control channel has something to say.
+        """
+        sources = [control]
+        if self.bus_terminal is not None:
+            sources.append(self.bus_terminal.master)
+        ready, _, _ = select.select(sources, [], [], self._idle_s(wait_s))
         now = time.monotonic()
         self._send_due(now)  # replies wait for nothing
-        has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
         is_idle = not self._replies and now >= self._settled_s
-        for servo in self._with_watchdog:
+        for servo in self._servos:
             servo.watch(now)
+        has_heard = self.bus_terminal is not None and self.bus_terminal.master in ready
         if self.bus_terminal is not None and has_heard:
-            heard = self.bus_terminal.read()
-            now = time.monotonic()  # it may hold what came since the moment before
-            if not self.bus_terminal.speaks(self.config.baudrate):
-                heard = b""  # noise
-            for packet in self._parser.feed(heard):
-                if self._way.random() < self.faults.unheard:
-                    continue
-                self._queue(self._bus.answer(packet, now), now)
-                if packet.instruction == protocol.SYNC_READ:
-                    for servo in self._servos:
-                        self.events.append((now, servo.servo_id, "present_position", servo.present_position))
-        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:  # after the answers, which are urgent
+            now = self._hear(self.bus_terminal)
+        # after the answers, which are urgent
+        if has_heard or is_idle or self._joints.lag(now) > _LONGEST_PHYSICS_S:
             self._joints.advance(now)
         self._send_due(time.monotonic())
-        self._measure_attitude(now)
-        while self._attitudes and self._attitudes[0][0] <= now:
-            self.imu_terminal.write(self._attitudes.popleft()[1])
+        self._imu.measure(self._joints.q[0], now, self.faults)
+        attitudes = self._imu.pop_due(now)
+        if attitudes:
+            self.imu_terminal.write(attitudes)
         return control in ready
 
     def set_faults(self, changes: dict[str, Any]) -> None:
@@ -153,8 +152,8 @@ class Emulator:
             self.bus_terminal.close()
             self.bus_terminal = None
         elif not self.faults.unplugged and self.bus_terminal is None:
-            self.bus_terminal = Terminal.opened()
-            self._parser = protocol.Parser()
+            self.bus_terminal = Terminal()
+            self._parser = packets.Parser()
             self._replies.clear()
 
     @property
@@ -174,24 +173,27 @@ class Emulator:
             "skipped_s": self._joints.skipped_s,
         }
 
-    def _idle(self, wait_s: float) -> float:
+    def _idle_s(self, wait_s: float) -> float:
+        """How long nothing is to be done [s], at most a time."""
         now = time.monotonic()
         physics_s = self._settled_s if self._settled_s > now else now + _PHYSICS_S
-        attitude_s = self._attitudes[0][0] if self._attitudes else math.inf
-        return max(min(now + wait_s, physics_s, self._next_imu_s, attitude_s, self._next_packet_s()) - now, 0.0)
+        return max(min(now + wait_s, physics_s, self._imu.next_s, self._next_packet_s()) - now, 0.0)
 
     def _next_packet_s(self) -> float:
         """When the adapter has enough replies to pass on, or has waited long enough."""
-        at, length = math.inf, 0
+        at = math.inf
+        length = 0
         for due, reply in self._replies:
             if due > self._replies[0][0] + _PACKET_S:
                 break
-            at, length = due, length + len(reply)
+            at = due
+            length += len(reply)
             if length >= _PACKET_BYTES:
                 break
         return at
 
     def _note(self, index: int, servo_id: int, name: str, value: int) -> None:
+        """Pass a change of a servo on to its joint."""
         self.events.append((time.monotonic(), servo_id, name, value))
         servo = self._servos[index]
         if name == "torque_enable":
@@ -200,13 +202,28 @@ class Emulator:
         if name == "goal_position" and servo.is_on:
             self._joints.command(index, servo.goal)
 
-    def _queue(self, replies: list[bytes], now: float) -> None:
-        for reply in replies:
-            sent, delay = damage(self.faults, reply, self._line)
-            wire_s = 10.0 * len(reply) / self.config.baudrate
-            begin = max(now + delay, self._replies[-1][0] if self._replies else now)
-            if sent:
-                self._replies.append((begin + wire_s, sent))
+    def _hear(self, terminal: Terminal) -> float:
+        """Answer the instructions that have come; returns when they were read."""
+        data = terminal.read()
+        now = time.monotonic()
+        if not terminal.has_rate(self.config.baudrate):
+            return now  # noise
+        for packet in self._parser.feed(data):
+            if self._instruction_faults.random() < self.faults.unheard:
+                continue
+            for reply in self._bus.answer(packet, now):
+                self._queue(reply, now)
+            if packet.instruction == packets.SYNC_READ:
+                for servo in self._servos:
+                    self.events.append((now, servo.servo_id, "present_position", servo["present_position"]))
+        return now
+
+    def _queue(self, reply: bytes, now: float) -> None:
+        data, delay_s = damage(self.faults, reply, self._reply_faults)
+        wire_s = 10.0 * len(reply) / self.config.baudrate
+        begin_s = max(now + delay_s, self._replies[-1][0] if self._replies else now)
+        if data:
+            self._replies.append((begin_s + wire_s, data))
 
     def _send_due(self, now: float) -> None:
         due = b""
@@ -216,36 +233,22 @@ class Emulator:
             self.bus_terminal.write(due)
             self._settled_s = time.monotonic() + _SETTLE_S
 
-    def _measure_attitude(self, now: float) -> None:
-        if now < self._next_imu_s:
-            return
-        period = 1.0 / self.config.imu_rate_hz
-        self._next_imu_s = max(self._next_imu_s + period, now)
-        if self.faults.imu_silent:
-            return
-        noise = self._imu.standard_normal(1)
-        roll = attitude(self.config.testbed.scenario.imu, self._joints.q[:1], np.zeros(1), noise)
-        # a real IMU should never send the same three angles twice; the roll is as good as the scenario says
-        pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
-        measured = math.remainder(float(roll[0]), 2.0 * math.pi), float(pitch), float(yaw)
-        self._angles = distort(self.faults, measured, self._angles)
-        sent = attitude_packet(*self._angles, now - self._start_s)
-        if self._imu.random() < self.faults.imu_corrupted:
-            sent = flip_bit(sent, self._imu)
-        self._attitudes.append((now + self.faults.imu_late_s, sent))
-
 
 def serve(config: EmulatorConfig) -> None:
-    """Emulate until the input ends; requests come as JSON lines, one each, and so do the answers."""
+    """Emulate until the input ends.
+
+    Requests come as JSON lines, one each, and so do the answers.
+    """
     emulator = Emulator(config)
     prefer_realtime(Priority.EMULATOR)
+    control = sys.stdin.fileno()
     answer: Any = emulator.ports
     pending = b""
     while True:
         print(json.dumps(answer), flush=True)
         while b"\n" not in pending:
-            if emulator.step(0.1, sys.stdin.fileno()):
-                data = os.read(sys.stdin.fileno(), 65536)
+            if emulator.step(_WAIT_S, control):
+                data = os.read(control, 65536)
                 if not data:
                     return
                 pending += data

@@ -1,1 +1,1 @@
-"""What keeps a moving joint safe: limits, a supervisor in a process of its own, checks before the motion."""
+"""Safety of a moving joint: limits, a supervisor process, checks before the motion."""

@@ -1,18 +1,26 @@
-"""What to look at before anything moves: firmware, voltage, temperature, errors, delays; each with its cure."""
+"""Checks before anything moves: firmware, voltage, temperature, errors, delays.
+
+Each with its cure.
+"""
 
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
-from elastic_env.hardware.servo_bus.bus import Bus
-from elastic_env.hardware.servo_bus.control_table import ServoModel, explain_errors
-from elastic_env.hardware.servo_bus.torque_line import LARGEST_TORQUE_NM, current_of_torque
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.servo_models import (
+    LARGEST_TORQUE_NM,
+    ServoModel,
+    current_of_torque,
+    explain_errors,
+)
 
 _POSITION_MODE = 3
 _FULL_REPLIES = 2
-_LARGEST_DELAY_S = 20e-6
-_DELAY_UNIT_S = 2e-6
+_LONGEST_DELAY_US = 20
+_DELAY_UNIT_US = 2
 _WARM_SHARE = 0.8
 _PINGS = 50
 _LOST = 2
@@ -27,17 +35,17 @@ class Check:
     what: str
     value: str
     cure: str = ""
-    """What to do about it; empty where nothing is wrong."""
+    """Cure; empty where nothing is wrong."""
     is_vital: bool = True
-    """Whether nothing may move before that is done."""
+    """True if nothing may move before that is done."""
 
     @property
     def is_good(self) -> bool:
-        """Whether nothing is to be done."""
+        """True if nothing is to be done."""
         return not self.cure
 
 
-def check_bus(bus: Bus, ids: Sequence[int]) -> list[Check]:
+def check_bus(bus: DynamixelBus, ids: Sequence[int]) -> list[Check]:
     """Look at the port and at every servo.
 
     Args:
@@ -49,13 +57,17 @@ def check_bus(bus: Bus, ids: Sequence[int]) -> list[Check]:
         HardwareError: Its model is not known.
     """
     bus.attach(ids)
-    checks = [Check("baud rate", f"{bus.port.baudrate} bit/s"), _latency_timer(bus), *_round_trips(bus, ids[0])]
+    checks = [
+        Check("baud rate", f"{bus.port.baudrate} bit/s"),
+        _check_latency(bus),
+        *_check_round_trips(bus, ids[0]),
+    ]
     for servo_id, model in bus.models.items():
-        checks += [replace(one, what=f"{servo_id}: {one.what}") for one in _check_servo(bus, servo_id, model)]
+        checks += [replace(check, what=f"{servo_id}: {check.what}") for check in _check_servo(bus, servo_id, model)]
     return checks
 
 
-def _latency_timer(bus: Bus) -> Check:
+def _check_latency(bus: DynamixelBus) -> Check:
     latency = bus.port.latency_timer_ms
     if latency is None:
         return Check("latency timer", "not an FTDI adapter, or not told; see the round trip")
@@ -63,58 +75,80 @@ def _latency_timer(bus: Bus) -> Check:
     return Check("latency timer", f"{latency} ms", cure, is_vital=False)
 
 
-def _round_trips(bus: Bus, servo_id: int) -> list[Check]:
-    times, retries = [], bus.num_retries
+def _check_round_trips(bus: DynamixelBus, servo_id: int) -> list[Check]:
+    times = []
+    retries = bus.num_retries
     for _ in range(_PINGS):
         begin = time.monotonic()
         bus.ping(servo_id)
         times.append(time.monotonic() - begin)
-    lost, typical = bus.num_retries - retries, statistics.median(times)
-    slow = (
-        "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to 0, and the bus to "
-        "1 Mbit/s or more"
+    lost = bus.num_retries - retries
+    typical = statistics.median(times)
+    faster = (
+        "too slow for 250 Hz: set the adapter's latency timer to 1 ms, the servos' return delay to "
+        "0, and the bus to 1 Mbit/s or more"
     )
-    bad = "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer busy"
+    better = "a bad line: look at plugs, cable, ground and termination, and at what else keeps the computer busy"
     trip = f"{1e3 * typical:.2f} ms, at most {1e3 * max(times):.2f} ms"
     return [
-        Check("round trip of a ping", trip, "" if typical < _SLOW_S else slow),
-        Check("lost replies", f"{lost} of {_PINGS} pings", "" if lost < _LOST else bad, is_vital=False),
+        Check("round trip of a ping", trip, _unless(typical < _SLOW_S, faster)),
+        Check(
+            "lost replies",
+            f"{lost} of {_PINGS} pings",
+            _unless(lost < _LOST, better),
+            is_vital=False,
+        ),
     ]
 
 
-def _check_servo(bus: Bus, servo_id: int, model: ServoModel) -> list[Check]:
-    def get(name: str) -> int:
-        return bus.read(servo_id, name)
+def _check_servo(bus: DynamixelBus, servo_id: int, model: ServoModel) -> list[Check]:
+    read = partial(bus.read, servo_id)
+    error = explain_errors(read("hardware_error_status"))
+    volts = read("present_input_voltage") / 10.0
+    low = read("min_voltage_limit") / 10.0
+    high = read("max_voltage_limit") / 10.0
+    degrees = read("present_temperature")
+    hottest = read("temperature_limit")
+    mode = read("operating_mode")
+    delay_us = _DELAY_UNIT_US * read("return_delay_time")
+    level = read("status_return_level")
+    amperes = read(model.current_limit) * model.current_unit
+    strongest = current_of_torque(LARGEST_TORQUE_NM)
+    counts = round(strongest / model.current_unit)
+    lowest = read("min_position_limit") * model.position_unit
+    highest = read("max_position_limit") * model.position_unit
+    is_on = bool(read("torque_enable"))
 
-    def unless(is_good: bool, cure: str) -> str:
-        return "" if is_good else cure
-
-    volts, low, high = (get(n) / 10.0 for n in ("present_input_voltage", "min_voltage_limit", "max_voltage_limit"))
-    degrees, hottest = get("present_temperature"), get("temperature_limit")
-    errors, mode = get("hardware_error_status"), get("operating_mode")
-    delay_s = _DELAY_UNIT_S * get("return_delay_time")
-    limit_a, needed_a = get(model.current_limit) * model.current_unit, current_of_torque(LARGEST_TORQUE_NM)
-    low_rad, high_rad = (get(n) * model.position_unit for n in ("min_position_limit", "max_position_limit"))
-    write = "with torque off, write"
+    restart = "remove the cause, then switch the power off and on"
+    supply = f"it must be {low:g} to {high:g} V"
+    cool = f"let it cool; limit {hottest} °C"
+    mend_mode = f"with torque off, write {_POSITION_MODE}, position, to operating_mode"
+    mend_delay = "with torque off, write 0 to return_delay_time"
+    mend_level = f"write {_FULL_REPLIES} to status_return_level"
+    hurts = f"more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"
+    mend_limit = f"with torque off, write {counts} to {model.current_limit}: {hurts}"
+    left_on = "a program left it on; it is switched off before anything begins"
+    watchdog = "yes" if model.has_watchdog else "not in this firmware; the supervisor stands in"
     return [
-        Check("model, firmware", f"{model.number} {model.name}, version {get('firmware_version')}"),
-        Check("hardware error", explain_errors(errors) or str(errors or "none"),
-              unless(not errors, "remove the cause, then switch the power off and on")),
-        Check("input voltage", f"{volts:.1f} V", unless(low < volts < high, f"it must be {low:g} to {high:g} V")),
-        Check("temperature", f"{degrees} °C",
-              unless(degrees < _WARM_SHARE * hottest, f"let it cool; limit {hottest} °C")),
-        Check("operating mode", str(mode), unless(mode == _POSITION_MODE, f"{write} 3, position, to operating_mode")),
-        Check("return delay", f"{1e6 * delay_s:.0f} µs",
-              unless(delay_s <= _LARGEST_DELAY_S, f"{write} 0 to return_delay_time")),
-        Check("status return level", str(get("status_return_level")),
-              unless(get("status_return_level") == _FULL_REPLIES, "write 2 to status_return_level")),
-        Check("current limit", f"{limit_a:.1f} A",
-              unless(limit_a <= needed_a + 0.1, f"{write} {round(needed_a / model.current_unit)} to "
-                     f"{model.current_limit}: more than {LARGEST_TORQUE_NM:g} N·m hurts the gear"), is_vital=False),
-        Check("position", f"{get('present_position') * model.position_unit:+.4f} rad"),
-        Check("position limits", f"{low_rad:.2f} to {high_rad:.2f} rad"),
-        Check("torque", "on" if get("torque_enable") else "off",
-              unless(not get("torque_enable"), "a program left it on; it is switched off before anything begins"),
-              is_vital=False),
-        Check("bus watchdog", "yes" if model.has_watchdog else "not in this firmware; the supervisor stands in"),
-    ]  # fmt: skip
+        Check("model, firmware", f"{model.number} {model.name}, version {read('firmware_version')}"),
+        Check("hardware error", error or "none", _unless(not error, restart)),
+        Check("input voltage", f"{volts:.1f} V", _unless(low < volts < high, supply)),
+        Check("temperature", f"{degrees} °C", _unless(degrees < _WARM_SHARE * hottest, cool)),
+        Check("operating mode", str(mode), _unless(mode == _POSITION_MODE, mend_mode)),
+        Check("return delay", f"{delay_us} µs", _unless(delay_us <= _LONGEST_DELAY_US, mend_delay)),
+        Check("status return level", str(level), _unless(level == _FULL_REPLIES, mend_level)),
+        Check(
+            "current limit",
+            f"{amperes:.1f} A",
+            _unless(amperes <= strongest + 0.1, mend_limit),
+            is_vital=False,
+        ),
+        Check("position", f"{bus.read_position(servo_id):+.4f} rad"),
+        Check("position limits", f"{lowest:.2f} to {highest:.2f} rad"),
+        Check("torque", "on" if is_on else "off", _unless(not is_on, left_on), is_vital=False),
+        Check("bus watchdog", watchdog),
+    ]
+
+
+def _unless(is_good: bool, cure: str) -> str:
+    return "" if is_good else cure

@@ -1,4 +1,4 @@
-"""Processes that must not wait for others, and the time they keep."""
+"""Real-time scheduling of processes, and the clock of a control loop."""
 
 import contextlib
 import gc
@@ -6,11 +6,14 @@ import os
 import time
 from enum import IntEnum
 
-from elastic_env.hardware.safety.bounds import exceeds
+from elastic_env.hardware.safety.guard import exceeds
+
+LONGEST_WAIT_S = 0.02
+"""How far ahead a control cycle may ask to be read [s]."""
 
 
 class Priority(IntEnum):
-    """Who goes before whom: what ends a motion before what moves, however busy that is."""
+    """Order of the processes: those that end a motion go before those that move, however busy."""
 
     LOOP = 5
     IMU_READER = 10
@@ -19,13 +22,18 @@ class Priority(IntEnum):
 
 
 def prefer_realtime(priority: Priority, *, with_threads: bool = False) -> bool:
-    """Ask for real-time scheduling of this thread; whether the system grants it (it needs the right to, see docs).
+    """Ask for real-time scheduling of this thread, to which a program needs the right, see docs.
 
-    What is in memory now is left out of garbage collections: one that looks at all of it takes ten control periods.
+    What is in memory now is left out of garbage collections: one that looks at all of it takes ten
+    control periods.
 
     Args:
         priority: Among the processes of a motion.
-        with_threads: Whether threads and programs that it starts from now on get the same; else they run as others do.
+        with_threads: True if threads and programs that it starts from now on get the same; else
+            they run as others do.
+
+    Returns:
+        True if the system grants it.
     """
     gc.collect()
     gc.freeze()
@@ -49,7 +57,8 @@ def schedule_like(thread_id: int) -> None:
 def give_up_realtime() -> None:
     """Back to the scheduling of all others, and to collections of everything."""
     gc.unfreeze()
-    with contextlib.suppress(OSError, AttributeError):  # the flag may be taken back with special rights only
+    # the flag may be taken back with special rights only
+    with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
 
 
@@ -63,8 +72,9 @@ def sleep_until(moment_s: float) -> None:
 class Pace:
     """Moments at which a control loop reads, one period after the other.
 
-    Small delays are caught up with. An overrun is a period whose command comes, or whose reading happens, more than
-    half a period late: a new one begins there, so that one hold-up counts once and what follows has its whole time.
+    Small delays are caught up with. An overrun is a period whose command comes, or whose reading
+    happens, more than half a period late: a new one begins there, so that one hold-up counts once
+    and what follows has its whole time.
 
     Args:
         period_s: Time between readings [s].
@@ -76,7 +86,8 @@ class Pace:
 
     def restart(self) -> None:
         """A period begins now."""
-        self._due_s, self._lost_s = time.monotonic(), 0.0
+        self._due_s = time.monotonic()
+        self._lost_s = 0.0
 
     def next(self) -> float:
         """When to read, for a command that is ready now: not before now [s, monotonic clock]."""
@@ -101,5 +112,5 @@ class Pace:
         return self._lost_s + late_s
 
     def is_overrun(self, late_s: float) -> bool:
-        """Whether a period was lost that was so late."""
+        """True if a period that was so late counts as lost."""
         return bool(exceeds(late_s, 0.5 * self._period_s))

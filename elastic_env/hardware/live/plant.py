@@ -1,4 +1,4 @@
-"""Servo and IMU in the place of the physics: one control cycle on the bus is one advance of a `Simulation`."""
+"""Servo and IMU in the place of the physics: one control cycle is one advance of a `Simulation`."""
 
 import math
 import sys
@@ -11,13 +11,13 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
+from elastic_env.hardware.buses.servo_models import torque_of_current
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.imu.attitude import AttitudeStream, link_angle
-from elastic_env.hardware.safety.bounds import exceeds
+from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.safety.guard import exceeds
 from elastic_env.hardware.safety.realtime import Pace, Priority, give_up_realtime, prefer_realtime
-from elastic_env.hardware.safety.supervised import Cycle, SupervisedBus
-from elastic_env.hardware.servo_bus.torque_line import torque_of_current
-from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.hardware.safety.supervised_bus import Cycle, SupervisedBus
+from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.trajectory import QUINTIC_PEAK_RATE, minimum_jerk
 
@@ -44,26 +44,19 @@ class CycleTiming:
 class ServoPlant:
     """A servo on a bus, an IMU on its link; see `elastic_env.runtime.physics.Simulation`.
 
-    Nothing is opened before the first `begin`. What cannot be measured is nan: the link's rate, and without an IMU its
-    angle.
+    Nothing is opened before the first `begin`. A quantity that cannot be measured is nan: the
+    link's rate, and without an IMU its angle.
 
     Args:
         model: The testbed's model, whose state vectors it fills.
         at: Where motor and link angle stand in them.
         settings: Wiring, mounting and limits.
         period_s: Control period [s].
-        pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first motion [N·m].
+        pendulum_nm: Torque of the pendulum at the horizontal, for the question before the first
+            motion [N·m].
     """
 
     num_worlds = 1
-
-    def __getstate__(self) -> dict[str, object]:
-        """There is one joint at a port, and no copy of it.
-
-        Raises:
-            HardwareError: Always.
-        """
-        raise HardwareError("an environment on hardware cannot be copied or pickled: there is one joint at its port")
 
     def __init__(
         self,
@@ -73,20 +66,32 @@ class ServoPlant:
         period_s: float,
         pendulum_nm: float,
     ) -> None:
-        self.model, self.settings = model, settings
+        self.model = model
+        self.settings = settings
         self.qpos: Array = np.full((1, model.nq), np.nan)
         self.qvel: Array = np.full((1, model.nv), np.nan)
         self.act: Array = np.zeros((1, model.na))
         self.ctrl: Array = np.zeros((1, model.nu))
         self.motor_torque = np.full(1, np.nan)
         self.timing = CycleTiming()
-        self._at, self._period_s, self._pendulum_nm = at, period_s, pendulum_nm
+        self._at = at
+        self._period_s = period_s
+        self._pendulum_nm = pendulum_nm
         self._bus: SupervisedBus | None = None
         self._imu: AttitudeStream | None = None
         self._is_agreed = not settings.confirm
         self._pace = Pace(period_s)
-        self._goal = self._read_s = 0.0
+        self._goal = 0.0
+        self._read_s = 0.0
         self._is_kept = False
+
+    def __getstate__(self) -> dict[str, object]:
+        """There is one joint at a port, and no copy of it.
+
+        Raises:
+            HardwareError: Always.
+        """
+        raise HardwareError("an environment on hardware cannot be copied or pickled: there is one joint at its port")
 
     def __del__(self) -> None:
         """A testbed that nobody holds any more gives its ports back."""
@@ -102,14 +107,17 @@ class ServoPlant:
         Raises:
             HardwareError: Nobody agreed, or something of the hardware is not as it must be.
         """
-        self._agree(angle)
-        with self._or_closed():
-            bus = self._opened()
+        if not self._is_agreed:
+            require_agreement(self.settings, angle, self._pendulum_nm)
+            self._is_agreed = True
+        with self._closing_on_error():
+            bus = self._open_bus()
             bus.disable()
             start = self.settings.joint_angle(float(bus.enable(self.settings.servo_limits)[0]))
             self._restart_clock()
             self._move(start, angle)
-            self._cycles(angle, _SETTLE_S)
+            for _ in range(round(_SETTLE_S / self._period_s)):
+                self._cycle(angle)
             self.timing = CycleTiming()
             bus.keep(self._servo_goal(angle))
             self._is_kept = True
@@ -118,34 +126,40 @@ class ServoPlant:
         """Command `ctrl`, wait for the end of the control period, read.
 
         Raises:
-            HardwareError: No episode is under way, or something of the hardware is not as it must be.
+            HardwareError: No episode is under way, or something of the hardware is not as it must
+                be.
         """
         if self._bus is None:
             raise HardwareError(f"no episode is under way at {self.settings.port}: begin one with reset()")
-        with self._or_closed():
+        with self._closing_on_error():
             if self._is_kept:  # the first step may come any time after the reset
-                self._opened().stop_keeping()
+                self._bus.stop_keeping()
                 self._restart_clock()
                 self._is_kept = False
             self._cycle(float(self.ctrl[0, 0]))
 
     def finish(self) -> None:
-        """Slowly back to where the pendulum hangs, then torque off; the ports are free for other programs."""
+        """Slowly back to where the pendulum hangs, then torque off and ports closed."""
         try:
             self._move(self._goal, 0.0)
         finally:
             self.close()
 
     def close(self) -> None:
-        """Torque off; ports closed. An error or an interrupt on whose way out this happens gets a note of it."""
-        bus, self._bus = self._bus, None
-        imu, self._imu = self._imu, None
+        """Torque off; ports closed.
+
+        An error or an interrupt on whose way out this happens gets a note of it.
+        """
+        bus = self._bus
+        imu = self._imu
+        self._bus = None
+        self._imu = None
         try:
             if bus is not None:
                 bus.close()
-                why = sys.exception()
-                if why is not None and bus.is_confirmed_off:
-                    why.add_note(f"torque at {self.settings.port} is off")
+                error = sys.exception()
+                if error is not None and bus.is_confirmed_off:
+                    error.add_note(f"torque at {self.settings.port} is off")
         finally:
             if imu is not None:
                 imu.close()
@@ -153,14 +167,14 @@ class ServoPlant:
                 give_up_realtime()
 
     def restart(self, worlds: BoolArray) -> None:
-        """See `Simulation`; an episode begins with `begin`."""
+        """Nothing: an episode begins with `begin`."""
+
+    def refresh(self, worlds: BoolArray) -> None:
+        """Nothing: hardware has nothing to compute."""
 
     def diverged(self) -> BoolArray:
         """Hardware does not diverge: where something is wrong, an error says what."""
         return np.zeros(1, dtype=np.bool_)
-
-    def refresh(self, worlds: BoolArray) -> None:
-        """See `Simulation`; hardware has nothing to compute."""
 
     def bind(self, field: str) -> Array:
         """Hardware has no fields of MuJoCo.
@@ -171,8 +185,8 @@ class ServoPlant:
         raise HardwareError(f"hardware has no {field!r} of MuJoCo")
 
     def views(self, fields: tuple[str, ...]) -> tuple[Array, ...]:
-        """See `elastic_env.runtime.physics.Simulation`."""
-        return tuple(self.bind(field) for field in fields)
+        """As `bind`, for several fields."""
+        return tuple(map(self.bind, fields))
 
     def vary(self, field: str) -> Array:
         """Hardware cannot be varied.
@@ -190,7 +204,7 @@ class ServoPlant:
         """
         raise HardwareError(f"world {world} of hardware cannot take a model of {model.nbody} bodies")
 
-    def _opened(self) -> SupervisedBus:
+    def _open_bus(self) -> SupervisedBus:
         settings = self.settings
         if self._bus is None:
             self._bus = SupervisedBus({settings.port: [settings.servo_id]}, settings.baudrate)
@@ -200,7 +214,7 @@ class ServoPlant:
         return self._bus
 
     @contextmanager
-    def _or_closed(self) -> Iterator[None]:
+    def _closing_on_error(self) -> Iterator[None]:
         """Torque off and ports closed where what is done within does not succeed."""
         try:
             yield
@@ -208,38 +222,12 @@ class ServoPlant:
             self.close()
             raise
 
-    def _agree(self, angle: float) -> None:
-        """Ask once before the first motion."""
-        if self._is_agreed:
-            return
-        limits = self.settings.limits
-        question = (
-            f"The servo at {self.settings.port} will move to {angle:.3f} rad, then anywhere between its limits, "
-            f"{limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of {self._pendulum_nm:.1f} N·m. Is "
-            "its way free, and the power switch in reach? Type the whole word yes: "
-        )
-        if not sys.stdin.isatty():
-            raise HardwareError(
-                f"nobody is at the terminal to agree to a motion at {self.settings.port}; if the way is free, say so "
-                "by --yes, in Python by confirm=False"
-            )
-        try:
-            answer = input(question)
-        except EOFError:
-            answer = ""
-        if answer.strip().lower() != "yes":
-            raise HardwareError(f"nobody agreed to the motion at {self.settings.port}; nothing has moved")
-        self._is_agreed = True
-
     def _move(self, start: float, end: float) -> None:
-        duration = max(QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S)
-        steps = int(np.ceil(duration / self._period_s))
+        """Move slowly from one angle to another [rad]."""
+        duration_s = max(QUINTIC_PEAK_RATE * abs(end - start) / self.settings.approach_rad_s, _SHORTEST_MOVE_S)
+        steps = int(np.ceil(duration_s / self._period_s))
         for share in minimum_jerk(np.arange(1, steps + 1) / steps):
             self._cycle(start + (end - start) * float(share))
-
-    def _cycles(self, angle: float, duration_s: float) -> None:
-        for _ in range(round(duration_s / self._period_s)):
-            self._cycle(angle)
 
     def _servo_goal(self, angle: float) -> Array:
         return np.array([self.settings.servo_angle(angle)])
@@ -249,50 +237,92 @@ class ServoPlant:
         self._read_s = time.monotonic()
 
     def _cycle(self, angle: float) -> None:
-        """One control period; where the reply is missing the command is held and the cycle repeated."""
-        bus, missed, limited, overruns = self._opened(), 0, False, 0
+        """One control period.
+
+        Where the reply is missing the command is held and the cycle repeated.
+        """
+        bus = self._open_bus()
+        missed = 0
+        overruns = 0
+        is_limited = False
         while True:
             due_s = self._pace.next()
             cycle = bus.exchange(self._servo_goal(angle), due_s)
-            limited |= bool(cycle.is_limited.any()) and not cycle.is_held
+            is_limited |= bool(cycle.is_limited.any()) and not cycle.is_held
             late_s = self._pace.late(due_s + cycle.late_s)
             overruns += self._pace.is_overrun(late_s)
             if cycle.states.is_fresh.all():
                 break
             missed += 1
-        self._take(cycle)
-        last = self.timing
+        self._read(cycle)
         self.timing = CycleTiming(
             jitter_s=late_s,
             period_s=cycle.states.time_s - self._read_s,
-            overruns=last.overruns + overruns,
-            missed_replies=last.missed_replies + missed,
-            limited=last.limited + limited,
+            overruns=self.timing.overruns + overruns,
+            missed_replies=self.timing.missed_replies + missed,
+            limited=self.timing.limited + is_limited,
         )
         self._read_s = cycle.states.time_s
 
-    def _take(self, cycle: Cycle) -> None:
-        settings, at = self.settings, self._at
+    def _read(self, cycle: Cycle) -> None:
+        """Put the measurements of a cycle into the state vectors."""
+        settings = self.settings
+        states = cycle.states
         self._goal = settings.joint_angle(float(cycle.goals[0]))
-        self.qpos[0, at.theta[0]] = settings.joint_angle(float(cycle.states.position[0]))
-        self.qvel[0, at.theta_dot[0]] = settings.direction * float(cycle.states.velocity[0])
-        self.motor_torque[0] = settings.direction * float(torque_of_current(cycle.states.current[0]))
+        self.qpos[0, self._at.theta[0]] = settings.joint_angle(float(states.position[0]))
+        self.qvel[0, self._at.theta_dot[0]] = settings.direction * float(states.velocity[0])
+        self.motor_torque[0] = settings.direction * float(torque_of_current(states.current[0]))
         if self._imu is not None:
             sample = self._imu.latest()
-            q = link_angle(sample, settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
-            self._require_together(q, cycle.states.time_s - sample.time_s)
-            self.qpos[0, at.q[0]] = q
+            q = sample.link_angle(settings.imu_axis, settings.imu_sign, settings.imu_offset_rad)
+            self._require_together(q, states.time_s - sample.time_s)
+            self.qpos[0, self._at.q[0]] = q
 
     def _require_together(self, q: float, age_s: float) -> None:
-        """Refuse a link that is where no gear bends to; the motor has moved on since the IMU measured."""
-        settings, at = self.settings, self._at
-        apart = q - float(self.qpos[0, at.theta[0]])
-        if math.isfinite(apart):  # of others there is no remainder, and they are too far
-            apart = math.remainder(apart, 2.0 * math.pi)
-        moved = abs(float(self.qvel[0, at.theta_dot[0]])) * max(age_s, 0.0)
-        if exceeds(abs(apart), settings.largest_deflection_rad + moved):
+        """Refuse a link that is where no gear bends to.
+
+        The motor has moved on since the IMU measured.
+        """
+        settings = self.settings
+        deflection = q - float(self.qpos[0, self._at.theta[0]])
+        if math.isfinite(deflection):  # of others there is no remainder, and they are too far
+            deflection = math.remainder(deflection, 2.0 * math.pi)
+        moved = abs(float(self.qvel[0, self._at.theta_dot[0]])) * max(age_s, 0.0)
+        if exceeds(abs(deflection), settings.largest_deflection_rad + moved):
             raise HardwareError(
-                f"the link, by the IMU at {settings.imu_port}, is {apart:+.2f} rad from the servo's angle, more than "
-                f"largest_deflection_rad {settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
+                f"the link, by the IMU at {settings.imu_port}, is {deflection:+.2f} rad from the "
+                "servo's angle, more than largest_deflection_rad "
+                f"{settings.largest_deflection_rad:g}: correct imu_sign, imu_axis and "
                 "imu_offset_rad of the mounting, or look what has come loose"
             )
+
+
+def require_agreement(settings: HardwareSettings, angle: float, pendulum_nm: float) -> None:
+    """Ask at the terminal whether the way of a motion is free.
+
+    Args:
+        settings: Port and limits.
+        angle: Where the motion goes first [rad].
+        pendulum_nm: Torque of the pendulum at the horizontal [N·m].
+
+    Raises:
+        HardwareError: Nobody is there, or agrees.
+    """
+    limits = settings.limits
+    question = (
+        f"The servo at {settings.port} will move to {angle:.3f} rad, then anywhere between its "
+        f"limits, {limits.lowest_rad:g} and {limits.highest_rad:g} rad, with a pendulum of "
+        f"{pendulum_nm:.1f} N·m. Is its way free, and the power switch in reach? Type the whole "
+        "word yes: "
+    )
+    if not sys.stdin.isatty():
+        raise HardwareError(
+            f"nobody is at the terminal to agree to a motion at {settings.port}; if the way is "
+            "free, say so by --yes, in Python by confirm=False"
+        )
+    try:
+        answer = input(question)
+    except EOFError:
+        answer = ""
+    if answer.strip().lower() != "yes":
+        raise HardwareError(f"nobody agreed to the motion at {settings.port}; nothing has moved")

@@ -1,4 +1,4 @@
-"""A program's side of the supervisor: servos that lose their torque when the program does not behave."""
+"""A program's side of the supervisor: servos that lose their torque when it does not behave."""
 
 import contextlib
 import subprocess
@@ -11,40 +11,50 @@ from typing import Any
 import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.hardware.errors import BusGoneError, FaultError, HardwareError, PortError, ReplyError
-from elastic_env.hardware.safety.channel import LONGEST_WAIT_S, Channel
-from elastic_env.hardware.safety.child_process import child_command, child_environment
-from elastic_env.hardware.safety.limits import SafetyLimits
-from elastic_env.hardware.safety.realtime import schedule_like
-from elastic_env.hardware.servo_bus.bus import Bus, Buses, States
-from elastic_env.hardware.servo_bus.port import DEFAULT_BAUDRATE
-from elastic_env.hardware.servo_bus.protocol import require_ids
+from elastic_env.hardware.buses.bus import BusGroup, States
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.packets import require_ids
+from elastic_env.hardware.buses.port import DEFAULT_BAUDRATE
+from elastic_env.hardware.errors import (
+    BusGoneError,
+    FaultError,
+    HardwareError,
+    PortError,
+    ReplyError,
+)
+from elastic_env.hardware.safety.processes import Channel, start_child
+from elastic_env.hardware.safety.realtime import LONGEST_WAIT_S, schedule_like
+from elastic_env.hardware.settings import SafetyLimits
 
 _ERRORS = {error.__name__: error for error in (HardwareError, BusGoneError, FaultError, ReplyError, PortError)}
 _KEEP_ALIVE_S = 0.008
 _ANSWER_S = 0.1
-"""Longest silence of a supervisor beyond what was asked for [s]; then it is taken for dead, and torque switched off.
+"""Longest silence of a supervisor beyond what was asked for [s].
 
-In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the other wait too.
+Then it is taken for dead, and torque switched off.
+
+In motion it is `SafetyLimits.hang_s`, as for the program: what makes one of the two wait makes the
+other wait too.
 """
 _LEAST_ANSWER_S = 0.02
 _READ_S = 0.05
 _SLOW_S = 5.0
 _SLOW_PER_SERVO_S = 1.0
 _START_S = 30.0
+_END_S = 5.0
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """What came of one control cycle."""
+    """Result of one control cycle."""
 
     states: States
     goals: Array
-    """What was commanded, (n,) [rad]."""
+    """Commanded positions, (n,) [rad]."""
     is_limited: BoolArray
-    """Where that is not what was asked for, (n,)."""
+    """True where that is not what was asked for, (n,)."""
     is_held: bool
-    """Whether the last command was repeated because a reply was missing."""
+    """True if the last command was repeated because a reply was missing."""
     late_s: float
     """How much later than asked for the servos were read [s]."""
 
@@ -57,7 +67,9 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         baudrate: Bits per second.
 
     Attributes:
-        is_confirmed_off: Whether all servos have said that their torque is off, and nothing has enabled it since.
+        models: Model numbers of the servos, a list for each port.
+        is_confirmed_off: Whether all servos have said that their torque is off, and nothing has
+            enabled it since.
 
     Raises:
         PortError: A port cannot be had.
@@ -69,34 +81,39 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
     def __init__(self, ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE) -> None:
         for ids in ports.values():
             require_ids(ids)
-        self._ports, self._baudrate = {port: list(ids) for port, ids in ports.items()}, baudrate
-        # confirmations and checks, several tries for each servo that does not answer
-        self._slow_s = _SLOW_S + _SLOW_PER_SERVO_S * sum(map(len, self._ports.values()))
         self.models: list[list[int]] = []
-        own, other = Channel.pair()
-        with other:
-            self._process = subprocess.Popen(
-                child_command("elastic_env.hardware.safety.supervisor", str(other.fileno()), str(baudrate), *ports),
-                env=child_environment(), pass_fds=[other.fileno()], start_new_session=True, stdin=subprocess.DEVNULL,
-            )  # fmt: skip
-        self._channel = Channel(own)
-        self._number = 0
-        self._is_enabled = False
-        self._answer_s = _ANSWER_S
         self.is_confirmed_off = False
+        self._ports = {port: list(ids) for port, ids in ports.items()}
+        self._baudrate = baudrate
+        self._is_enabled = False
+        self._number = 0
+        self._answer_s = _ANSWER_S
+        # for confirmations and checks: several tries for each servo that does not answer
+        self._slow_s = _SLOW_S + _SLOW_PER_SERVO_S * sum(map(len, self._ports.values()))
         self._lock = threading.Lock()
         self._keeper: threading.Thread | None = None
         self._is_kept = threading.Event()
+        own, other = Channel.pair()
+        self._channel = Channel(own)
+        with other:
+            self._process = start_child(
+                "elastic_env.hardware.safety.supervisor",
+                str(other.fileno()),
+                str(baudrate),
+                *ports,
+                pass_fds=[other.fileno()],
+                stdin=subprocess.DEVNULL,
+            )
         try:
-            self._hear(0, _START_S)
-            self.models = self._ask("attach", self._slow_s, ids=list(self._ports.values()))["models"]
+            self._receive(0, _START_S)
+            self.models = self._request("attach", self._slow_s, ids=list(self._ports.values()))["models"]
         except BaseException:
             self.close()
             raise
 
     @property
     def process_id(self) -> int:
-        """Of the supervisor."""
+        """Process id of the supervisor."""
         return self._process.pid
 
     def enable(self, limits: SafetyLimits | None = None) -> Array:
@@ -110,10 +127,11 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             ReplyError: A servo does not answer, or does not take the goal where it stands.
             BusGoneError: The port is gone.
         """
-        self._is_enabled, self.is_confirmed_off = True, False
-        given = limits or SafetyLimits()
-        answer = self._ask("enable", self._slow_s, limits=given.model_dump())
-        self._answer_s = max(given.hang_s, _LEAST_ANSWER_S)
+        limits = limits or SafetyLimits()
+        self._is_enabled = True
+        self.is_confirmed_off = False
+        answer = self._request("enable", self._slow_s, limits=limits.model_dump())
+        self._answer_s = max(limits.hang_s, _LEAST_ANSWER_S)
         return np.array(answer["position"])
 
     def exchange(self, goals: Array, at: float) -> Cycle:
@@ -129,31 +147,37 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         """
         self.stop_keeping()
         try:
-            answer = self._exchanged(np.asarray(goals, dtype=np.float64), at)
+            answer = self._exchange(np.asarray(goals, dtype=np.float64), at)
         except HardwareError:
             self._is_enabled = False  # the message says what became of torque
             raise
         except BaseException:
-            self._let_go()
+            # torque off after an interrupted cycle, whatever its answer would have been
+            with contextlib.suppress(HardwareError, OSError):
+                self._request("disable", _ANSWER_S)
             raise
         return Cycle(
-            _states(answer), np.array(answer["goals"]), np.array(answer["limited"]), bool(answer["held"]),
-            float(answer["late_s"]),
-        )  # fmt: skip
+            states=States.load(answer),
+            goals=np.array(answer["goals"]),
+            is_limited=np.array(answer["is_limited"]),
+            is_held=bool(answer["is_held"]),
+            late_s=float(answer["late_s"]),
+        )
 
     def read(self) -> States:
         """States without a command."""
-        return _states(self._ask("read", _READ_S + self._answer_s))
+        return States.load(self._request("read", _READ_S + self._answer_s))
 
     def keep(self, goals: Array, limit_s: float = 5.0) -> None:
-        """Hold goals from a thread until the next cycle, for at most a time: between moving and stepping.
+        """Hold goals from a thread until the next cycle, for at most a time [s].
 
         A program that hangs as a whole takes the thread with it, and torque goes off as ever.
         """
         self.stop_keeping()
         self._is_kept.set()
-        now, caller = time.monotonic(), threading.get_native_id()
-        self._keeper = threading.Thread(target=self._keep, args=(goals, now + limit_s, caller), daemon=True)
+        end_s = time.monotonic() + limit_s
+        arguments = (goals, end_s, threading.get_native_id())
+        self._keeper = threading.Thread(target=self._keep, args=arguments, daemon=True)
         self._keeper.start()
 
     def stop_keeping(self) -> None:
@@ -167,12 +191,13 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         schedule_like(caller)
         with contextlib.suppress(HardwareError):
             while self._is_kept.is_set() and time.monotonic() < end_s:
-                self._exchanged(goals, time.monotonic() + _KEEP_ALIVE_S)
+                self._exchange(goals, time.monotonic() + _KEEP_ALIVE_S)
 
-    def _exchanged(self, goals: Array, at: float) -> dict[str, Any]:
-        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan as its second value
+    def _exchange(self, goals: Array, at: float) -> dict[str, Any]:
+        # the supervisor refuses to wait longer, or for a moment that is none; max gives 0 for nan
+        # as its second value
         wait_s = min(max(0.0, at - time.monotonic()), LONGEST_WAIT_S)
-        return self._ask("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
+        return self._request("exchange", wait_s + self._answer_s, goals=goals.tolist(), at=at)
 
     def disable(self) -> None:
         """Torque off.
@@ -182,15 +207,17 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
             BusGoneError: The port is gone.
         """
         self.stop_keeping()
-        self._is_enabled = self.is_confirmed_off = False
-        self._ask("disable", _ANSWER_S)
+        self._is_enabled = False
+        self.is_confirmed_off = False
+        self._request("disable", _ANSWER_S)
         self.is_confirmed_off = True
 
     def close(self) -> None:
         """Torque off, and give the ports back; a second time does nothing.
 
         Raises:
-            ReplyError: A servo does not confirm that its torque is off; the ports are given back all the same.
+            ReplyError: A servo does not confirm that its torque is off; the ports are given back
+                all the same.
             BusGoneError: The port is gone.
         """
         try:
@@ -199,37 +226,32 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
         finally:
             self._channel.close()
             try:
-                self._process.wait(timeout=5.0)
+                self._process.wait(timeout=_END_S)
             except subprocess.TimeoutExpired:
                 self._process.terminate()
-                self._process.wait(timeout=5.0)
+                self._process.wait(timeout=_END_S)
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _let_go(self) -> None:
-        """Torque off after an interrupted cycle, whatever its answer would have been."""
-        with contextlib.suppress(HardwareError, OSError):
-            self._ask("disable", _ANSWER_S)
-
-    def _ask(self, action: str, within_s: float, **arguments: Any) -> dict[str, Any]:
+    def _request(self, action: str, within_s: float, **arguments: Any) -> dict[str, Any]:
         """The answer to a request, which must come within a time [s]."""
         with self._lock:
             self._number += 1
             try:
                 self._channel.send({"number": self._number, "do": action, "with": arguments})
             except OSError:
-                raise self._without_supervisor() from None
-            return self._hear(self._number, within_s)
+                raise self._replace_supervisor() from None
+            return self._receive(self._number, within_s)
 
-    def _hear(self, number: int, within_s: float) -> dict[str, Any]:
+    def _receive(self, number: int, within_s: float) -> dict[str, Any]:
         """The answer of a number; those of requests that were interrupted are passed over."""
         end_s = time.monotonic() + within_s
         while self._channel.is_waiting(max(end_s - time.monotonic(), 0.0)):
             answer = self._channel.receive()
             if answer is None:
-                raise self._without_supervisor()
-            if "busy" in answer:  # torque off is sent, whoever asked for it; its confirmation may take
+                raise self._replace_supervisor()
+            if "busy" in answer:  # torque off is sent; its confirmation takes longer
                 within_s = self._slow_s
                 end_s = time.monotonic() + within_s
             elif answer["number"] == number:
@@ -237,70 +259,70 @@ class SupervisedBus(contextlib.AbstractContextManager["SupervisedBus"]):
                     raise _ERRORS[answer["error"]](answer["message"])
                 return answer
         self._process.kill()
-        raise self._without_supervisor(within_s)
+        raise self._replace_supervisor(within_s)
 
-    def _without_supervisor(self, silent_s: float | None = None) -> FaultError:
-        """The supervisor died, or was silent for a time [s] and had to: switch torque off in its place."""
+    def _replace_supervisor(self, silent_s: float | None = None) -> FaultError:
+        """Switch torque off for a supervisor that died, or was silent for a time [s]."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)  # its end of the channel closes before its port does
-        how = f"ended (exit code {self._process.poll()})"
-        if silent_s is not None:
+        if silent_s is None:
+            how = f"ended (exit code {self._process.poll()})"
+        else:
             how = f"did not answer within {1e3 * silent_s:.0f} ms and was ended"
         return FaultError(f"the supervisor process {how}; {emergency_stop(self._ports, self._baudrate, self.models)}")
 
 
 def emergency_stop(
-    ports: Mapping[str, Sequence[int]], baudrate: int = DEFAULT_BAUDRATE, models: Sequence[Sequence[int]] = ()
+    ports: Mapping[str, Sequence[int]],
+    baudrate: int = DEFAULT_BAUDRATE,
+    models: Sequence[Sequence[int]] = (),
 ) -> str:
     """Switch torque off without a supervisor.
 
     Args:
         ports: Ids of the servos by port.
         baudrate: Bits per second.
-        models: Their model numbers, in that order; where they are not given each servo is asked for its own first.
+        models: Their model numbers, in that order; where they are not given each servo is asked for
+            its own first.
 
     Returns:
         What came of it, in words.
     """
-    said: list[str] = []
-    buses: list[Bus] = []
+    problems: list[str] = []
+    buses: list[DynamixelBus] = []
     with contextlib.ExitStack() as opened:
         for number, (port, ids) in enumerate(ports.items()):
-            bus = Bus(port, baudrate)
+            bus = DynamixelBus(port, baudrate)
             try:
                 bus.open()
-                opened.enter_context(_closed(bus))
-                bus.attach_known(dict(zip(ids, models[number], strict=True)) if models else _models(bus, ids, said))
+                opened.enter_context(_closing(bus))
+                known = dict(zip(ids, models[number], strict=True)) if models else _ask_models(bus, ids, problems)
+                bus.attach_known(known)
                 buses.append(bus)
             except HardwareError as error:
-                said.append(f"torque could not be switched off: {error}")
-        problem = Buses(buses).let_go() if buses else None
+                problems.append(f"torque could not be switched off: {error}")
+        problem = BusGroup(buses).torque_off() if buses else None
     if problem is not None:
-        said.append(str(problem))
+        problems.append(str(problem))
     elif any(bus.models for bus in buses):
-        said.append("torque of the others is off" if said else "torque is off")
-    return "; ".join(dict.fromkeys(said))
+        problems.append("torque of the others is off" if problems else "torque is off")
+    return "; ".join(dict.fromkeys(problems))
 
 
 @contextlib.contextmanager
-def _closed(bus: Bus) -> Iterator[None]:
+def _closing(bus: DynamixelBus) -> Iterator[None]:
     """Close a bus at the end; one that is gone cannot be, which has been said before."""
     yield
     with contextlib.suppress(HardwareError):
         bus.close()
 
 
-def _models(bus: Bus, ids: Sequence[int], said: list[str]) -> dict[int, int]:
-    """Model numbers of the servos that answer, by id; of the others is said that they do not."""
+def _ask_models(bus: DynamixelBus, ids: Sequence[int], problems: list[str]) -> dict[int, int]:
+    """Model numbers of the servos that answer, by id; adds those that do not to the problems."""
     models = {}
     for servo_id in ids:
         try:
             models[servo_id] = bus.ping(servo_id).model_number
         except ReplyError as error:
-            said.append(f"torque could not be switched off: {error}")
+            problems.append(f"torque could not be switched off: {error}")
     return models
-
-
-def _states(answer: dict[str, Any]) -> States:
-    names = ("position", "velocity", "current", "is_fresh", "has_alert", "temperature")
-    return States(**{name: np.array(answer[name]) for name in names}, time_s=float(answer["time_s"]))

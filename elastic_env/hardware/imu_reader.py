@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from elastic_env.core.errors import missing_extra
-from elastic_env.hardware.imu.attitude import Attitude, SharedSample
+from elastic_env.hardware.imu import Attitude, SharedSample
 from elastic_env.hardware.safety.realtime import Priority, prefer_realtime
 
 _CHANNELS = ("estRoll", "estPitch", "estYaw")
@@ -18,30 +18,26 @@ _STALE_AT_FIRST_S = 0.1
 def read(shared: SharedSample, port: str, baudrate: int) -> None:
     """Put every valid attitude into shared memory until the input is closed.
 
-    What lay in the port's buffer before has no known age and is passed over. Damaged packets the library drops itself.
+    What lay in the port's buffer before has no known age and is passed over. Damaged packets the
+    library drops itself.
     """
-    mscl = _library()
+    try:
+        import mscl
+    except ModuleNotFoundError:
+        raise missing_extra("pymscl", "hardware", "reading the IMU") from None
     prefer_realtime(Priority.IMU_READER, with_threads=True)  # the library reads in one of its own
     connection = mscl.Connection.Serial(port, baudrate)
     node = mscl.InertialNode(connection)
     begin = time.monotonic()
     while not select.select([sys.stdin], [], [], 0.0)[0]:
         for packet in node.getDataPackets(_WAIT_MS):
-            sample = _sample(packet)
+            sample = _attitude(packet)
             if sample is not None and sample.time_s > begin + _STALE_AT_FIRST_S:
                 shared.put(sample)
     connection.disconnect()
 
 
-def _library() -> Any:
-    try:
-        import mscl
-    except ModuleNotFoundError:
-        raise missing_extra("pymscl", "hardware", "reading the IMU") from None
-    return mscl
-
-
-def _sample(packet: Any) -> Attitude | None:
+def _attitude(packet: Any) -> Attitude | None:
     """The attitude of a packet, None if it has none that is valid."""
     points = {point.channelName(): point for point in packet.data()}
     if not all(name in points and points[name].valid() for name in _CHANNELS):

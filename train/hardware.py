@@ -1,4 +1,4 @@
-"""Commands for the testbed on real hardware: scan, check, run, emulate."""
+"""The testbed on real hardware: list servos, check them, run an episode, emulate a bus."""
 
 import contextlib
 import csv
@@ -17,15 +17,14 @@ from rich.table import Table
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.config import Model, load_yaml
 from elastic_env.core.errors import ConfigurationError, require_known, shown
-from elastic_env.hardware.emulator.config import EmulatorConfig
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.packets import RATES, require_ids
+from elastic_env.hardware.buses.servo_models import servo_models
 from elastic_env.hardware.emulator.faults import Faults
-from elastic_env.hardware.emulator.running import RunningEmulator
-from elastic_env.hardware.imu.attitude import AttitudeStream
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.imu import AttitudeStream
 from elastic_env.hardware.safety.checks import Check, check_bus
-from elastic_env.hardware.servo_bus.bus import Bus
-from elastic_env.hardware.servo_bus.control_table import servo_models
-from elastic_env.hardware.servo_bus.protocol import RATES, require_ids
-from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.model import Pendulum
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
@@ -40,40 +39,51 @@ PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
 
 
 class Mounting(HardwareSettings):
-    """What `--mounting` names: how the testbed is wired and mounted, and the pendulum that hangs there."""
+    """The file of `--mounting`: wiring and mounting of the testbed, and its pendulum."""
 
     pendulum: Pendulum = Pendulum()
 
 
 def hardware_arguments(
-    port: str | None, imu_port: str | None, settings: Path | None, *, yes: bool, patient: bool = False
+    port: str | None,
+    imu_port: str | None,
+    settings: Path | None,
+    *,
+    yes: bool,
+    patient: bool = False,
 ) -> dict[str, Any]:
-    """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command; empty without hardware.
+    """Arguments of `elastic_env/HardwareTestbed-v0` from the options of a command.
+
+    Empty without hardware.
 
     Args:
         port: Port of the servo, or None for that of the settings.
         imu_port: Port of the IMU, likewise.
         settings: YAML file of a `Mounting`, or None.
         yes: Whether nobody need agree before the first motion.
-        patient: Whether a motion goes on for as long as it can where replies, commands or attitudes are missing.
+        patient: Whether a motion goes on for as long as it can where replies, commands or attitudes
+            are missing.
 
     Raises:
         ConfigurationError: There are options of hardware, but no port.
     """
     if port is None and settings is None:
-        without = {"--imu-port": imu_port is not None, "--yes": yes, "--patient": patient}
-        if any(without.values()):
-            option = next(name for name, is_given in without.items() if is_given)
-            raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
+        for option, is_given in {
+            "--imu-port": imu_port is not None,
+            "--yes": yes,
+            "--patient": patient,
+        }.items():
+            if is_given:
+                raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
         return {}
     options = {"port": port, "imu_port": imu_port, "confirm": False if yes else None}
-    given = {name: value for name, value in options.items() if value is not None}
-    chosen = Mounting(**given) if settings is None else load_yaml(settings, Mounting, given)
-    names = chosen.model_fields_set | options.keys() | {"limits"}
-    values = {name: getattr(chosen, name) for name in names}
+    changes = {name: value for name, value in options.items() if value is not None}
+    mounting = Mounting(**changes) if settings is None else load_yaml(settings, Mounting, changes)
+    names = mounting.model_fields_set | options.keys() | {"limits"}
+    values = {name: getattr(mounting, name) for name in names}
     if patient:
-        oldest_s = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
-        values |= {"limits": chosen.limits.replace(**PATIENT_LIMITS), "imu_oldest_s": oldest_s}
+        values["limits"] = mounting.limits.replace(**PATIENT_LIMITS)
+        values["imu_oldest_s"] = max(mounting.imu_oldest_s, _PATIENT_IMU_S)
     return {name: value.model_dump() if isinstance(value, Model) else value for name, value in values.items()}
 
 
@@ -88,29 +98,40 @@ def scan(port: str, baudrate: int | None, console: Console) -> int:
     if baudrate is not None:
         HardwareSettings(port=port, baudrate=baudrate)  # checks it
     table = Table("bit/s", "id", "model number", "model", "firmware", title=f"servos at {port}")
-    number = 0
     for rate in RATES if baudrate is None else (baudrate,):
-        with Bus(port, rate) as bus:
-            for found in bus.scan():
-                model = servo_models().get(found.model_number)
+        with DynamixelBus(port, rate) as bus:
+            for servo in bus.scan():
+                model = servo_models().get(servo.model_number)
                 name = model.name if model is not None else "not known here"
-                table.add_row(str(rate), str(found.servo_id), str(found.model_number), name, str(found.firmware))
-                number += 1
-    if number:
+                table.add_row(
+                    str(rate),
+                    str(servo.servo_id),
+                    str(servo.model_number),
+                    name,
+                    str(servo.firmware),
+                )
+    if table.row_count:
         console.print(table)
     else:
         console.print(
             f"no servo answers at {port}; check power, wiring and baud rate, and whether it is the IMU's port",
             soft_wrap=True,
         )
-    return number
+    return table.row_count
 
 
-def check(port: str, ids: list[int], baudrate: int, imu_port: str | None, imu_baudrate: int, console: Console) -> bool:
+def check(
+    port: str,
+    ids: list[int],
+    baudrate: int,
+    imu_port: str | None,
+    imu_baudrate: int,
+    console: Console,
+) -> bool:
     """Look at port, servos and IMU; whether all is well. Nothing moves, nothing is written."""
     HardwareSettings(port=port, baudrate=baudrate, imu_port=imu_port, imu_baudrate=imu_baudrate)  # checks them
     require_ids(ids)
-    with Bus(port, baudrate) as bus:
+    with DynamixelBus(port, baudrate) as bus:
         checks = check_bus(bus, ids)
     if imu_port is not None:
         with AttitudeStream(imu_port, imu_baudrate) as stream:
@@ -132,7 +153,7 @@ def run(
     console: Console,
     output: Path | None = None,
 ) -> Path:
-    """Play one episode on hardware, show it as it goes, and keep every step in log.csv, also of one that is cut short.
+    """Play one episode, show it as it goes, and keep every step in log.csv, also if cut short.
 
     Args:
         arguments: Of the environment.
@@ -146,22 +167,28 @@ def run(
     """
     env: Any = gymnasium.make(environment("hardware").id, disable_env_checker=True, reference=reference, **arguments)
     with contextlib.closing(env):
-        who = make_policy(policy, env)
-        configuration = {"policy": policy.model_dump(mode="json"), "reference": reference, **arguments}
+        player = make_policy(policy, env)
+        configuration = {
+            "policy": policy.model_dump(mode="json"),
+            "reference": reference,
+            **arguments,
+        }
         with run_folder("hardware", configuration, None, output) as folder:
             metrics: dict[str, Any] = {}
-            with _kept(folder / "log.csv", console) as log:
-                for info in _episode(env, who):
-                    log.take(info)
+            with _open_log(folder / "log.csv", console) as log:
+                for info in _play(env, player):
+                    log.write(info)
                     metrics = info.get("episode_metrics", metrics)
             (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
             return folder
 
 
-def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
-    """What every step of an episode tells."""
+def _play(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
+    """The `info` of every step of an episode."""
     observation, _ = env.reset()
-    state, start, truncated = None, np.array(True), False
+    state = None
+    start = np.array(True)
+    truncated = False
     while not truncated:
         action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
         observation, _, _, truncated, info = env.step(action)
@@ -170,7 +197,10 @@ def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
 
 
 class _Log:
-    """The rows of log.csv, and a line on the console once a second, up to which all rows are on the disk."""
+    """The rows of log.csv, and a line on the console once a second.
+
+    Then all rows are on the disk.
+    """
 
     _SHOWN = (
         ("t", "s", "time_s", 1.0, "7.1f"),
@@ -185,11 +215,12 @@ class _Log:
 
     def __init__(self, file: TextIO, console: Console) -> None:
         self.num_rows = 0
-        self._file, self._console = file, console
+        self._file = file
+        self._console = console
         self._writer: csv.DictWriter[str] | None = None
         self._next_s = _SHOWN_S
 
-    def take(self, info: dict[str, Any]) -> None:
+    def write(self, info: dict[str, Any]) -> None:
         row = {key: value for key, value in info.items() if not isinstance(value, dict)}
         if self._writer is None:
             self._writer = csv.DictWriter(self._file, list(row))
@@ -208,7 +239,7 @@ class _Log:
 
 
 @contextlib.contextmanager
-def _kept(path: Path, console: Console) -> Iterator[_Log]:
+def _open_log(path: Path, console: Console) -> Iterator[_Log]:
     """A log that stays whatever ends the episode."""
     with path.open("w", newline="") as file:
         log = _Log(file, console)
@@ -233,7 +264,10 @@ def require_switches(names: Sequence[str]) -> None:
 
 
 def emulate(
-    config: EmulatorConfig, console: Console, later: Mapping[str, bool] | None = None, after_s: float = 0.0
+    config: EmulatorConfig,
+    console: Console,
+    later: Mapping[str, bool] | None = None,
+    after_s: float = 0.0,
 ) -> None:
     """Emulate until Ctrl-C.
 
@@ -253,7 +287,8 @@ def emulate(
         console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
         console.print(
             f"for example: elastic hardware check {emulator.port}, or\n"
-            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
+            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes "
+            "--patient\nCtrl-C ends it.",
             soft_wrap=True,
         )
         if later:

@@ -1,4 +1,4 @@
-"""Entry point of the registered environment on hardware: arguments of `gymnasium.make` become a task on a plant."""
+"""Entry points of the registered environment on hardware."""
 
 import inspect
 from functools import partial
@@ -6,17 +6,17 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
-from elastic_env.core.errors import ConfigurationError, shown, unknown_name
+from elastic_env.core.errors import ConfigurationError, require_known, shown
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.testbed import ID
-from elastic_env.hardware.testbed.settings import HardwareSettings
-from elastic_env.hardware.testbed.task import HardwareTestbedTask
+from elastic_env.hardware.live import ID
+from elastic_env.hardware.live.task import HardwareTestbedTask
+from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
 
 SCENARIO = "hardware"
-"""What stands for the scenario in tables of results."""
+"""Name in the place of the scenario in tables of results."""
 _OF_A_SIMULATION = ("form", "timestep_s")
 
 
@@ -25,25 +25,24 @@ def configure_hardware(port: str | None = None, **arguments: Any) -> HardwareTes
 
     Args:
         port: Port of the servo.
-        **arguments: Those of `HardwareSettings`, and of `configure_testbed` of `elastic_env.robots.testbed.environment`
-            but for `form` and `timestep_s`; `scenario` can only be "hardware" or "nominal", and changes nothing.
+        **arguments: Those of `HardwareSettings`, and of `configure_testbed` of
+            `elastic_env.robots.testbed.environment` but for `form` and `timestep_s`; `scenario` can
+            only be "hardware" or "nominal", and changes nothing.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.
     """
     if port is None:
         raise ConfigurationError(f"{ID} needs port, such as /dev/ttyUSB0; see: elastic hardware scan PORT")
-    of_settings = [name for name in HardwareSettings.model_fields if name != "port"]
+    of_settings = list(HardwareSettings.model_fields)
     of_testbed = [name for name in inspect.signature(configure_testbed).parameters if name not in _OF_A_SIMULATION]
-    for name in arguments:
-        if name not in (*of_settings, *of_testbed):
-            raise unknown_name(f"argument of {ID}", name, ["port", *of_settings, *of_testbed])
+    require_known(f"argument of {ID}", arguments, [*of_settings, *of_testbed])
     scenario = arguments.pop("scenario", SCENARIO)
     if scenario not in (SCENARIO, "nominal"):
         raise HardwareError(f"a scenario is of a simulation; on hardware it is what it is, got {shown(scenario)}")
-    settings = HardwareSettings(port=port, **{name: arguments.pop(name) for name in of_settings if name in arguments})
+    settings = {name: arguments.pop(name) for name in of_settings if name in arguments}
     config = configure_testbed(scenario="ideal", **arguments)
-    return HardwareTestbedTask(config, settings)
+    return HardwareTestbedTask(config, HardwareSettings(port=port, **settings))
 
 
 def make(render_mode: str | None = None, **arguments: Any) -> ElasticEnv:

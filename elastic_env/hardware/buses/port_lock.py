@@ -1,8 +1,8 @@
-"""One program per serial port: the lock that everything that opens one takes first, before it touches the line.
+"""One program per serial port: the lock that is taken before anything touches the line.
 
-It is an advisory lock (flock): programs that take none are not refused. The stronger mark TIOCEXCL would refuse them,
-but it outlives a program that is killed while any other has the port open, and then keeps out the one that is to
-switch torque off.
+It is an advisory lock (flock): programs that take none are not refused. The stronger mark TIOCEXCL
+would refuse them, but it outlives a program that is killed while any other has the port open, and
+then keeps out the one that is to switch torque off.
 """
 
 import errno
@@ -20,7 +20,8 @@ def lock_port(name: str) -> int:
         name: Device, such as /dev/ttyUSB0.
 
     Returns:
-        A descriptor; the port is given back when it is closed, and by the system when the program ends.
+        A descriptor; the port is given back when it is closed, and by the system when the program
+        ends.
 
     Raises:
         PortError: There is no such port, it may not be opened, or another program has it.
@@ -31,39 +32,39 @@ def lock_port(name: str) -> int:
         raise cannot_open(name, error.errno, str(error.strerror)) from None
     try:
         if not os.isatty(descriptor):
-            raise PortError(f"cannot open the port {name}: it is no serial port; {_what_there_is()}")
+            raise PortError(f"cannot open the port {name}: it is no serial port; {_found_ports()}")
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise _taken(name) from None
+        raise _port_in_use(name) from None
     except BaseException:
         os.close(descriptor)
         raise
     return descriptor
 
 
-def cannot_open(name: str, number: object, words: str) -> PortError:
-    """What to do about a port that the system does not open, by the number of its error and what it says."""
+def cannot_open(name: str, number: object, reason: str) -> PortError:
+    """The error, with its cure, of a port that the system does not open for a reason."""
     if number == errno.EBUSY:
-        return _taken(name)
+        return _port_in_use(name)
     if number == errno.EACCES:
         cure = "you may not open it: sudo usermod -aG dialout $USER, then log in again"
     elif number in (errno.ENOENT, errno.ENXIO) or not Path(name).exists():
-        cure = f"there is no such device; {_what_there_is()}"
+        cure = f"there is no such device; {_found_ports()}"
     elif Path(name).is_dir():
-        cure = f"it is a folder; {_what_there_is()}"
+        cure = f"it is a folder; {_found_ports()}"
     else:
-        cure = words
+        cure = reason
     return PortError(f"cannot open the port {name}: {cure}")
 
 
-def _taken(name: str) -> PortError:
+def _port_in_use(name: str) -> PortError:
     return PortError(
-        f"another program uses {name}; two on one bus would garble each other's packets. End that program "
-        f"(fuser {name} says which it is), or name another port"
+        f"another program uses {name}; two on one bus would garble each other's packets. End that "
+        f"program (fuser {name} says which it is), or name another port"
     )
 
 
-def _what_there_is() -> str:
+def _found_ports() -> str:
     found = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in Path("/dev").glob(pattern))
     return f"found: {', '.join(found) or 'no USB serial adapter'}"

@@ -10,7 +10,7 @@ What differs, because a real joint does not tell it:
 | `truth()`, and with it the policy `oracle` | an error |
 
 Beside the signals of the simulation stand `jitter` [s], `period` [s], `overruns`, `missed_replies` and `limited`, see
-`elastic_env.hardware.testbed.plant.CycleTiming`.
+`elastic_env.hardware.live.plant.CycleTiming`.
 """
 
 from typing import Any
@@ -19,8 +19,8 @@ import numpy as np
 
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.hardware.errors import HardwareError
-from elastic_env.hardware.testbed.plant import ServoPlant
-from elastic_env.hardware.testbed.settings import HardwareSettings
+from elastic_env.hardware.live.plant import ServoPlant
+from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.task import TestbedTask

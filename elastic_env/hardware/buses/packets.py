@@ -1,9 +1,9 @@
-"""Packets of Dynamixel Protocol 2.0: checksum, byte stuffing, instructions and status [ROBOTIS e-manual, protocol2].
+"""Packets of Dynamixel Protocol 2.0 [ROBOTIS e-manual, protocol2]: checksum, stuffing, status.
 
     FF FF FD 00  id  length (2)  instruction  parameters ...  CRC-16 (2)
 
-Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a header never occurs there; length and
-checksum count what is sent.
+Within instruction and parameters FF FF FD is sent as FF FF FD FD, so that a header never occurs
+there; length and checksum count what is sent.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,30 @@ BROADCAST = 0xFE
 LARGEST_ID = 0xFC
 STATUS = 0x55
 
-PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, REBOOT = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08
-SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A
-BULK_READ, BULK_WRITE, FAST_BULK_READ = 0x92, 0x93, 0x9A
+PING = 0x01
+READ = 0x02
+WRITE = 0x03
+REG_WRITE = 0x04
+ACTION = 0x05
+FACTORY_RESET = 0x06
+REBOOT = 0x08
+SYNC_READ = 0x82
+SYNC_WRITE = 0x83
+FAST_SYNC_READ = 0x8A
+BULK_READ = 0x92
+BULK_WRITE = 0x93
+FAST_BULK_READ = 0x9A
 
 ALERT = 0x80
 """Bit of a status that says: read `hardware_error_status`."""
 
-RESULT_FAIL, INSTRUCTION_ERROR, CRC_ERROR = 0x01, 0x02, 0x03
-RANGE_ERROR, LENGTH_ERROR, LIMIT_ERROR, ACCESS_ERROR = 0x04, 0x05, 0x06, 0x07
+RESULT_FAIL = 0x01
+INSTRUCTION_ERROR = 0x02
+CRC_ERROR = 0x03
+RANGE_ERROR = 0x04
+LENGTH_ERROR = 0x05
+LIMIT_ERROR = 0x06
+ACCESS_ERROR = 0x07
 STATUS_ERRORS = {
     RESULT_FAIL: "it could not process the instruction",
     INSTRUCTION_ERROR: "it does not know the instruction",
@@ -34,14 +49,17 @@ STATUS_ERRORS = {
     LIMIT_ERROR: "the value is beyond the servo's limit",
     ACCESS_ERROR: "the register cannot be read or written now; EEPROM is locked while torque is on",
 }
-"""What the number in a status means."""
+"""Meaning of the error number in a status."""
 
-_POLYNOMIAL = 0x8005
 RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
 """Rates that servos, SDK and pseudo-terminals share, the likeliest first [bit/s]."""
-LOWEST_RATE, HIGHEST_RATE = 9_600, 10_500_000
-"""Of servos and IMU, by their manuals [bit/s]."""
-_LONGEST = 1024
+LOWEST_RATE = 9_600
+HIGHEST_RATE = 10_500_000
+"""Range of servos and IMU, by their manuals [bit/s]."""
+LONGEST_PACKET = 1024
+"""Longest packet of the SDK [bytes]."""
+
+_POLYNOMIAL = 0x8005
 _STUFFED = b"\xff\xff\xfd"
 
 
@@ -73,20 +91,30 @@ def crc16(data: bytes, crc: int = 0) -> int:
 
 
 def stuff(body: bytes) -> bytes:
-    """Instruction and parameters as they are sent: FD behind every FF FF FD."""
+    """Instruction and parameters as they are sent: FD stands behind every FF FF FD."""
     return body.replace(_STUFFED, _STUFFED + b"\xfd")
 
 
 def unstuff(body: bytes) -> bytes:
-    """What `stuff` was given."""
+    """Instruction and parameters without the bytes that `stuff` added."""
     return body.replace(_STUFFED + b"\xfd", _STUFFED)
+
+
+def word(value: int) -> bytes:
+    """Two bytes, the low one first, as addresses and lengths are sent."""
+    return value.to_bytes(2, "little")
+
+
+def words(data: bytes) -> tuple[int, int]:
+    """The first two words of some bytes: in most instructions address and length."""
+    return int.from_bytes(data[:2], "little"), int.from_bytes(data[2:4], "little")
 
 
 def packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
     """A packet as it goes over the wire."""
     body = stuff(bytes([instruction]) + parameters)
-    head = HEADER + bytes([servo_id]) + (len(body) + 2).to_bytes(2, "little") + body
-    return head + crc16(head).to_bytes(2, "little")
+    head = HEADER + bytes([servo_id]) + word(len(body) + 2) + body
+    return head + word(crc16(head))
 
 
 def status(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
@@ -102,7 +130,7 @@ class Packet:
     instruction: int
     parameters: bytes
     is_intact: bool = True
-    """Whether the checksum fits; of a packet that is not intact only the id is of use."""
+    """True if the checksum fits; of a packet that is not intact only the id is of use."""
 
 
 class Parser:
@@ -114,10 +142,7 @@ class Parser:
     def feed(self, data: bytes) -> list[Packet]:
         """The packets that are complete with these bytes, in order."""
         self._bytes += data
-        found = []
-        while (one := self._next()) is not None:
-            found.append(one)
-        return found
+        return list(iter(self._next, None))
 
     def _next(self) -> Packet | None:
         while True:
@@ -129,14 +154,14 @@ class Parser:
             if len(self._bytes) < 7:
                 return None
             length = int.from_bytes(self._bytes[5:7], "little")
-            if not 3 <= length <= _LONGEST:
+            if not 3 <= length <= LONGEST_PACKET:
                 del self._bytes[: len(HEADER)]
                 continue
             raw = bytes(self._bytes[: 7 + length])
             is_whole = len(raw) == 7 + length
             is_intact = is_whole and crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
-            # in what is stuffed no header occurs, with the checksum behind it one may: only where the packet is not
-            # intact does a header before its end mean that the rest was lost
+            # in what is stuffed no header occurs, with the checksum behind it one may: only where
+            # the packet is not intact does a header before its end mean that the rest was lost
             again = self._bytes.find(HEADER, len(HEADER))
             if not is_intact and 0 < again < 7 + length:
                 del self._bytes[:again]

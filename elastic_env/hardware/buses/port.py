@@ -1,14 +1,14 @@
-"""dynamixel-sdk's port and packet handler, with what version 4.1 does not do mended.
+"""Port and packet handler of dynamixel-sdk, with the faults of version 4.1 mended.
 
 | trap of dynamixel-sdk 4.1 | here |
 |---|---|
-| outgoing packets are not byte-stuffed | `PacketHandler.txPacket` sends what `protocol.stuff` makes |
-| unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` is `protocol.unstuff` |
-| every reply may take 34 ms before it counts as missing | `Port.reply_timeout_s` |
+| outgoing packets are not byte-stuffed | `PacketHandler.txPacket` stuffs them |
+| unstuffing looks at bytes that it has already moved | `PacketHandler.removeStuffing` |
+| every reply may take 34 ms before it counts as missing | `DynamixelBus.reply_timeout_s` |
 | waiting for a reply is a busy loop | `Port` blocks in the read |
-| each reply is read in two pieces, by two calls of the system each | `Port.readPort` reads all that is there |
+| each reply is read in two pieces | `Port.readPort` reads all that is there |
 | an interrupted read leaves the port "in use", and torque off is refused | `Port.release` |
-| an unplugged port raises SerialException, or OSError, or termios.error | `bus_gone` makes one error of them |
+| an unplugged port raises one of three errors | `bus_gone` makes one error of them |
 | two programs can open one port and speak at the same time | `Port` locks it, see `port_lock` |
 """
 
@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from elastic_env.core.errors import missing_extra
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.port_lock import cannot_open, lock_port
 from elastic_env.hardware.errors import BusGoneError, PortError
-from elastic_env.hardware.servo_bus import protocol
-from elastic_env.hardware.servo_bus.port_lock import cannot_open, lock_port
 
 try:
     import serial
@@ -36,7 +36,6 @@ DEFAULT_BAUDRATE = 3_000_000
 """Bits per second: the fastest that servos, adapter and SDK share without an odd rate."""
 
 _READ_SLICE_S = 1e-3
-_LONGEST_PACKET = 1024
 
 
 @contextmanager
@@ -50,8 +49,9 @@ def bus_gone(port: str) -> Iterator[None]:
         yield
     except (serial.SerialException, OSError, termios.error) as error:
         raise BusGoneError(
-            f"the bus at {port} is gone ({_words(error)}): unplugged, or its adapter failed. Its servos may be under "
-            "torque: at their last goal, or where a bus watchdog has stopped them. Switch their power off"
+            f"the bus at {port} is gone ({_reason(error)}): unplugged, or its adapter failed. Its "
+            "servos may be under torque: at their last goal, or where a bus watchdog has stopped "
+            "them. Switch their power off"
         ) from None
 
 
@@ -66,7 +66,6 @@ class Port(PortHandler):
     def __init__(self, name: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
         super().__init__(name)
         self.baudrate = baudrate
-        self.reply_timeout_s = 0.05
         self._read_ahead = b""
         self._lock: int | None = None
 
@@ -78,13 +77,13 @@ class Port(PortHandler):
         """
         name = self.port_name
         if self.getCFlagBaud(self.baudrate) < 0:
-            raise PortError(f"the SDK has no rate of {self.baudrate} bit/s for {name}; try one of {protocol.RATES}")
+            raise PortError(f"the SDK has no rate of {self.baudrate} bit/s for {name}; try one of {packets.RATES}")
         self._lock = lock_port(name)
         try:
             self.setupPort(self.baudrate)
         except (OSError, termios.error) as error:  # of which SerialException is one
             self.closePort()
-            raise cannot_open(name, error.args[0], _words(error)) from None
+            raise cannot_open(name, error.args[0], _reason(error)) from None
         except BaseException:
             self.closePort()
             raise
@@ -100,17 +99,14 @@ class Port(PortHandler):
         """Bytes that have come, at most so many; waits a short while for the first one."""
         if len(self._read_ahead) < length:
             self._read_ahead += self.ser.read(max(self.ser.in_waiting, 1))
-        taken, self._read_ahead = self._read_ahead[:length], self._read_ahead[length:]
-        return taken
+        data = self._read_ahead[:length]
+        self._read_ahead = self._read_ahead[length:]
+        return data
 
     def clearPort(self) -> None:  # noqa: N802
         """Forget what has come."""
         self._read_ahead = b""
         super().clearPort()
-
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        """Time for a reply: the bytes on the wire, and `reply_timeout_s`."""
-        self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + 1e3 * self.reply_timeout_s)
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Milliseconds of a clock that nobody sets."""
@@ -122,7 +118,9 @@ class Port(PortHandler):
 
     def closePort(self) -> None:  # noqa: N802
         """Close; a second time, or without having been open, does nothing."""
-        lock, self._lock, self._read_ahead = self._lock, None, b""
+        lock = self._lock
+        self._lock = None
+        self._read_ahead = b""
         try:
             if self.ser is not None:
                 with bus_gone(self.port_name):
@@ -139,7 +137,10 @@ class Port(PortHandler):
 
     @property
     def latency_timer_ms(self) -> int | None:
-        """How long a USB adapter collects bytes before it passes them on [ms]; None where nobody says."""
+        """How long a USB adapter collects bytes before it passes them on [ms].
+
+        None where nobody says.
+        """
         try:
             return int(self.latency_timer.read_text())
         except (OSError, ValueError):
@@ -150,27 +151,27 @@ class PacketHandler(Protocol2PacketHandler):
     """The SDK's packet handler with byte stuffing in both directions."""
 
     def txPacket(self, port: Any, txpacket: list[int]) -> Any:  # noqa: N802  the SDK's name
-        """Send an instruction that the SDK has laid out: id, instruction and parameters at their places."""
+        """Send an instruction that the SDK has laid out."""
         if port.is_using:
             return COMM_PORT_BUSY
         length = txpacket[5] | txpacket[6] << 8
-        sent = protocol.packet(txpacket[4], txpacket[7], bytes(txpacket[8 : 5 + length]))
-        if len(sent) > _LONGEST_PACKET:
+        wire = packets.packet(txpacket[4], txpacket[7], bytes(txpacket[8 : 5 + length]))
+        if len(wire) > packets.LONGEST_PACKET:
             return COMM_TX_ERROR
         port.is_using = True
         port.clearPort()
-        if port.writePort(sent) != len(sent):
+        if port.writePort(wire) != len(wire):
             port.is_using = False
             return COMM_TX_FAIL
         return COMM_SUCCESS
 
     def removeStuffing(self, packet: list[int]) -> list[int]:  # noqa: N802
         """A received packet without its stuffing; its length field fits again."""
-        body = protocol.unstuff(bytes(packet[7:-2]))
+        body = packets.unstuff(bytes(packet[7:-2]))
         length = len(body) + 2
         return [*packet[:5], length & 0xFF, length >> 8, *body, *packet[-2:]]
 
 
-def _words(error: Exception) -> str:
-    """What an error says; termios gives a number and a text."""
+def _reason(error: Exception) -> str:
+    """The text of an error; termios gives a number before it."""
     return str(error.args[1]) if len(error.args) > 1 else str(error)

@@ -1,0 +1,359 @@
+"""Dynamixel servos on one port: registers, goals in one packet, states in another.
+
+A state is read as one block per servo. A request asks for a length (`ServoModel.blocks`) that none
+of the last ones still awaits. So a reply that comes late is known as old and left out. Temperatures
+lie farther off and change slowly: only every 25th request is for a block that reaches as far.
+"""
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from elastic_env.core.signals import Array
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.bus import TEMPERATURE_CYCLES, States, servo_name
+from elastic_env.hardware.buses.packets import word
+from elastic_env.hardware.buses.port import (
+    COMM_SUCCESS,
+    DEFAULT_BAUDRATE,
+    PacketHandler,
+    Port,
+    bus_gone,
+)
+from elastic_env.hardware.buses.servo_models import (
+    NUM_BLOCKS,
+    ServoModel,
+    explain_errors,
+    servo_model,
+)
+from elastic_env.hardware.errors import HardwareError, ReplyError
+
+_TRIES = 3
+_QUIET_S = 0.03
+_REPLY_TIMEOUT_S = 0.05
+_WATCHDOG_COUNTS = 3  # of 20 ms
+_STATUS_BYTES = 11
+
+
+@dataclass(frozen=True)
+class ServoInfo:
+    """A servo's answer to a ping."""
+
+    servo_id: int
+    model_number: int
+    firmware: int
+
+
+class DynamixelBus:
+    """Dynamixel servos of Protocol 2.0 on a port; a `Bus`.
+
+    Args:
+        port: Device, such as /dev/ttyUSB0.
+        baudrate: Bits per second.
+
+    Attributes:
+        models: Types of the attached servos, by id.
+        num_retries: Requests that were sent again because no reply came, or none that was intact.
+    """
+
+    def __init__(self, port: str, baudrate: int = DEFAULT_BAUDRATE) -> None:
+        self.name = port
+        self.port = Port(port, baudrate)
+        self.models: dict[int, ServoModel] = {}
+        self.reply_timeout_s = _REPLY_TIMEOUT_S
+        self.num_retries = 0
+        self._handler = PacketHandler()
+        self._cycles_without_temperature = TEMPERATURE_CYCLES
+        self._awaited: deque[range | None] = deque(maxlen=NUM_BLOCKS - 1)
+        """Blocks that the last requests asked for; None where all servos answered."""
+
+    def open(self) -> None:
+        """Open and lock the port.
+
+        Raises:
+            PortError: It cannot be had.
+        """
+        self.port.open()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.port.closePort()
+
+    def __enter__(self) -> "DynamixelBus":
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Ids of the attached servos, in order."""
+        return tuple(self.models)
+
+    def scan(self) -> list[ServoInfo]:
+        """All servos that answer a broadcast ping, by id."""
+        with bus_gone(self.name):
+            answers, _ = self._handler.broadcastPing(self.port)
+        return [ServoInfo(servo_id, *values) for servo_id, values in sorted(answers.items())]
+
+    def ping(self, servo_id: int) -> ServoInfo:
+        """Model number and firmware of one servo.
+
+        Raises:
+            ReplyError: It does not answer.
+        """
+        reply = self._request(servo_id, packets.PING, b"", length=3)
+        return ServoInfo(servo_id, int.from_bytes(reply[:2], "little"), reply[2])
+
+    def attach(self, ids: Sequence[int]) -> None:
+        """Take servos into the cycle; each is asked for its model, which decides on its registers.
+
+        Raises:
+            ConfigurationError: Ids that no servo can have, or one twice.
+            ReplyError: A servo does not answer.
+            HardwareError: Its model is not known.
+        """
+        packets.require_ids(ids)
+        self.attach_known({servo_id: self.ping(servo_id).model_number for servo_id in ids})
+
+    def attach_known(self, numbers: Mapping[int, int]) -> None:
+        """Take servos into the cycle without asking them anything.
+
+        Args:
+            numbers: Model numbers by id.
+
+        Raises:
+            HardwareError: A model is not known, or they do not go together.
+        """
+        self.models = {servo_id: servo_model(number) for servo_id, number in numbers.items()}
+        if len({model.blocks for model in self.models.values()}) > 1:
+            names = ", ".join(f"{servo_id}: {model.name}" for servo_id, model in self.models.items())
+            raise HardwareError(f"the servos of one bus must have one control table, at {self.name} are {names}")
+
+    def read(self, servo_id: int, name: str) -> int:
+        """A register [count].
+
+        Raises:
+            ReplyError: No answer in three tries, or a refusal.
+        """
+        register = self.models[servo_id].table[name]
+        data = self._request(servo_id, packets.READ, word(register.address) + word(register.size), register.size)
+        return register.decode(data)
+
+    def write(self, servo_id: int, name: str, value: int) -> None:
+        """Write a register [count].
+
+        Raises:
+            ReplyError: No answer in three tries, or a refusal, with the servo's reason.
+        """
+        register = self.models[servo_id].table[name]
+        self._request(servo_id, packets.WRITE, word(register.address) + register.encode(value), length=0)
+
+    def write_all(self, name: str, values: Mapping[int, int]) -> None:
+        """Write a register of several servos, by id [count], in one packet, which nobody confirms.
+
+        Raises:
+            BusGoneError: The port is gone.
+        """
+        if not values:
+            return
+        register = self.models[next(iter(values))].table[name]
+        data = word(register.address) + word(register.size)
+        data += b"".join(bytes([servo_id]) + register.encode(value) for servo_id, value in values.items())
+        self._send(packets.BROADCAST, packets.SYNC_WRITE, data)
+        self.port.release()
+
+    def read_position(self, servo_id: int) -> float:
+        """Present position of one servo [rad]."""
+        return self.read(servo_id, "present_position") * self.models[servo_id].position_unit
+
+    def read_velocity(self, servo_id: int) -> float:
+        """Present velocity of one servo [rad/s]."""
+        return self.read(servo_id, "present_velocity") * self.models[servo_id].velocity_unit
+
+    def read_temperature(self, servo_id: int) -> float:
+        """Present temperature of one servo [°C]."""
+        return float(self.read(servo_id, "present_temperature"))
+
+    def read_temperature_limit(self, servo_id: int) -> float:
+        """Highest temperature by the servo's own setting [°C]."""
+        return float(self.read(servo_id, "temperature_limit"))
+
+    def read_error(self, servo_id: int) -> str:
+        """The hardware error that a servo reports, "" if none."""
+        return explain_errors(self.read(servo_id, "hardware_error_status"))
+
+    def write_goal(self, servo_id: int, angle: float) -> None:
+        """Command one servo [rad], which confirms it.
+
+        Raises:
+            ReplyError: As `write`.
+        """
+        self.write(servo_id, "goal_position", round(angle / self.models[servo_id].position_unit))
+
+    def write_goals(self, angles: Array) -> None:
+        """Command all servos at once.
+
+        Args:
+            angles: Goal positions in the order of `ids`, (n,) [rad].
+        """
+        units = np.array([model.position_unit for model in self.models.values()])
+        counts = np.rint(angles / units).astype(np.int64).tolist()
+        self.write_all("goal_position", dict(zip(self.ids, counts, strict=True)))
+
+    def write_torque(self, servo_id: int, is_on: bool) -> None:
+        """Switch the torque of one servo, which confirms it."""
+        self.write(servo_id, "torque_enable", int(is_on))
+
+    def write_watchdog(self, servo_id: int, is_on: bool) -> None:
+        """Set the bus watchdog of a servo to 60 ms, or clear it.
+
+        Nothing on models that have none.
+        """
+        if self.models[servo_id].has_watchdog:
+            self.write(servo_id, "bus_watchdog", _WATCHDOG_COUNTS if is_on else 0)
+
+    def torque_off(self) -> None:
+        """Switch all torque off; also after a read that was interrupted.
+
+        Raises:
+            BusGoneError: The port is gone.
+        """
+        for _ in range(2):  # nobody confirms a packet to all; a second one costs nothing
+            self.port.release()
+            self.write_all("torque_enable", dict.fromkeys(self.ids, 0))
+
+    def confirm_torque_off(self) -> list[str]:
+        """Names of the servos that do not say that their torque is off, after some tries each."""
+        return [servo_name(self, servo_id) for servo_id in self.ids if not self._is_off(servo_id)]
+
+    def _is_off(self, servo_id: int) -> bool:
+        try:
+            if self.read(servo_id, "torque_enable") != 0:
+                self.write_torque(servo_id, False)
+        except ReplyError:
+            return False
+        return True
+
+    def read_states(self, timeout_s: float) -> States:
+        """Position, velocity and current of all servos, and now and then their temperature.
+
+        Args:
+            timeout_s: How long to wait for all replies together.
+
+        Raises:
+            BusGoneError: The port is gone.
+        """
+        block = self._next_block()
+        self._awaited.append(block)
+        self._send(
+            packets.BROADCAST,
+            packets.SYNC_READ,
+            word(block.start) + word(len(block)) + bytes(self.ids),
+        )
+        self.port.setPacketTimeoutMillis(1e3 * timeout_s)
+        replies: dict[int, bytes] = {}
+        alerts: set[int] = set()
+        while len(replies) < len(self.ids):
+            reply = self._receive()
+            if reply is None:
+                if self.port.getTimeSinceStart() >= 1e3 * timeout_s:
+                    break
+                continue
+            servo_id, error, data = reply
+            if error & packets.ALERT:
+                alerts.add(servo_id)
+            if len(data) == len(block) and error & ~packets.ALERT == 0 and servo_id in self.models:
+                replies[servo_id] = data
+        if len(replies) == len(self.ids):
+            self._awaited[-1] = None
+        states = self._decode(block, replies, alerts)
+        self._cycles_without_temperature += 1
+        if not np.isnan(states.temperature).any():
+            self._cycles_without_temperature = 0
+        return states
+
+    def _next_block(self) -> range:
+        """The shortest block that no reply is awaited for, with the temperature if that is due."""
+        model = next(iter(self.models.values()))
+        free = [block for block in model.blocks if block not in self._awaited]
+        if self._cycles_without_temperature + 1 < TEMPERATURE_CYCLES:
+            return free[0]
+        return next(filter(model.has_temperature, free), free[0])
+
+    def _decode(self, block: range, replies: Mapping[int, bytes], alerts: set[int]) -> States:
+        values = np.full((len(self.ids), 4), np.nan)
+        for row, (servo_id, model) in enumerate(self.models.items()):
+            if servo_id in replies:
+                values[row] = model.decode_block(block, replies[servo_id])
+        position, velocity, current, temperature = values.T.copy()
+        return States(
+            position=position,
+            velocity=velocity,
+            current=current,
+            is_fresh=np.array([servo_id in replies for servo_id in self.ids]),
+            has_alert=np.array([servo_id in alerts for servo_id in self.ids]),
+            time_s=time.monotonic(),
+            temperature=temperature,
+        )
+
+    def _request(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> bytes:
+        """The data of a reply.
+
+        A few tries, with silence in between so that no late reply answers the next one.
+        """
+        problem = "does not answer"
+        for _ in range(_TRIES):
+            self._send(servo_id, instruction, parameters)
+            wire_ms = self.port.tx_time_per_byte * (_STATUS_BYTES + length)
+            self.port.setPacketTimeoutMillis(wire_ms + 1e3 * self.reply_timeout_s)
+            while (reply := self._receive()) is not None:
+                sender, status, data = reply
+                error = status & ~packets.ALERT
+                if sender != servo_id:
+                    continue
+                if error == packets.CRC_ERROR:  # it has done nothing: worth another try
+                    problem = f"says that {packets.STATUS_ERRORS[error]}"
+                    break
+                if error:
+                    reason = packets.STATUS_ERRORS.get(error, f"error {error}, which the protocol does not have")
+                    raise ReplyError(f"{servo_name(self, servo_id)} refuses: {reason}")
+                if len(data) == length:
+                    return data
+            self._wait_for_silence()
+            self.num_retries += 1
+        raise ReplyError(
+            f"{servo_name(self, servo_id)} {problem} in {_TRIES} tries ({self.port.baudrate} "
+            "bit/s); check power, wiring, id and baud rate, and whether this is the port of the "
+            f"servos and not the IMU's, see: elastic hardware scan {self.name}"
+        )
+
+    def _send(self, servo_id: int, instruction: int, parameters: bytes) -> None:
+        length = len(parameters) + 3
+        frame = [0, 0, 0, 0, servo_id, length & 0xFF, length >> 8, instruction, *parameters, 0, 0]
+        self.port.release()
+        with bus_gone(self.name):
+            result = self._handler.txPacket(self.port, frame)
+        if result != COMM_SUCCESS:
+            raise ReplyError(f"cannot send at {self.name}: {self._handler.getTxRxResult(result)}")
+
+    def _receive(self) -> tuple[int, int, bytes] | None:
+        """Id, error and data of the next status; None if it is damaged, or none comes in time."""
+        with bus_gone(self.name):
+            received, result = self._handler.rxPacket(self.port, False)
+        if result != COMM_SUCCESS:
+            return None
+        return received[4], received[8], bytes(received[9:-2])
+
+    def _wait_for_silence(self) -> None:
+        with bus_gone(self.name):
+            self.port.release()
+            quiet_since = time.monotonic()
+            deadline = quiet_since + 10 * _QUIET_S
+            while time.monotonic() - quiet_since < _QUIET_S and time.monotonic() < deadline:
+                if self.port.readPort(256):
+                    quiet_since = time.monotonic()

@@ -1,0 +1,113 @@
+"""The emulated MicroStrain IMU: attitudes of the link as packets of the MIP protocol.
+
+    75 65  set  length  [field length  field  data ...] ...  checksum (2)
+
+Numbers are big endian; the checksum is Fletcher's, both sums modulo 256 (as the maker's SDK has
+it).
+"""
+
+import math
+import struct
+from collections import deque
+
+import numpy as np
+
+from elastic_env.hardware.emulator.faults import Faults, flip_bit
+from elastic_env.hardware.emulator.launch import EmulatorConfig
+from elastic_env.runtime.sensors import attitude
+
+Angles = tuple[float, float, float]
+"""Roll, pitch and yaw [rad]."""
+
+_FILTER_SET = 0x82
+_EULER_ANGLES = 0x05
+_GPS_TIME = 0x11
+_VALID = 1
+_WOBBLE_RAD = 1e-5
+_NO_ANGLE = 8.0
+
+
+class EmulatedImu:
+    """Measures the link angle at its rate, and keeps the packets until they are due.
+
+    Args:
+        config: Rate, seed, and through the scenario of the testbed the quality.
+        start_s: The clock when it begins [s].
+    """
+
+    def __init__(self, config: EmulatorConfig, start_s: float) -> None:
+        self._quality = config.testbed.scenario.imu
+        self._period_s = 1.0 / config.imu_rate_hz
+        self._generator = np.random.default_rng([config.seed, 1])
+        self._wobble = np.random.default_rng([config.seed, 3])
+        self._start_s = start_s
+        self._measured_next_s = start_s
+        self._angles: Angles = (0.0, 0.0, 0.0)
+        self._packets: deque[tuple[float, bytes]] = deque()
+
+    @property
+    def next_s(self) -> float:
+        """When it measures or sends next [s]."""
+        return min(self._measured_next_s, self._packets[0][0] if self._packets else math.inf)
+
+    def measure(self, q: float, now: float, faults: Faults) -> None:
+        """Measure the link angle [rad] if that is due."""
+        if now < self._measured_next_s:
+            return
+        self._measured_next_s = max(self._measured_next_s + self._period_s, now)
+        if faults.imu_silent:
+            return
+        noise = self._generator.standard_normal(1)
+        roll = attitude(self._quality, np.array([q]), np.zeros(1), noise)
+        # a real IMU should never send the same three angles twice; the roll is as good as the
+        # scenario says
+        pitch, yaw = _WOBBLE_RAD * self._wobble.standard_normal(2)
+        angles = (math.remainder(float(roll[0]), 2.0 * math.pi), float(pitch), float(yaw))
+        self._angles = distort(faults, angles, self._angles)
+        packet = attitude_packet(*self._angles, now - self._start_s)
+        if self._generator.random() < faults.imu_corrupted:
+            packet = flip_bit(packet, self._generator)
+        self._packets.append((now + faults.imu_late_s, packet))
+
+    def pop_due(self, now: float) -> bytes:
+        """Packets that are to be sent by now."""
+        due = b""
+        while self._packets and self._packets[0][0] <= now:
+            due += self._packets.popleft()[1]
+        return due
+
+
+def distort(faults: Faults, angles: Angles, last: Angles) -> Angles:
+    """The angles that a faulty IMU sends.
+
+    Args:
+        faults: What is wrong with it.
+        angles: Measured ones.
+        last: Those of the packet before.
+    """
+    if faults.imu_frozen:
+        return last
+    rolls = {math.nan: faults.imu_nan, math.inf: faults.imu_inf, _NO_ANGLE: faults.imu_out_of_range}
+    roll = next((roll for roll, is_on in rolls.items() if is_on), angles[0])
+    return roll, *angles[1:]
+
+
+def checksum(data: bytes) -> bytes:
+    """Fletcher's checksum of everything before it."""
+    first = second = 0
+    for byte in data:
+        first = (first + byte) & 0xFF
+        second = (second + first) & 0xFF
+    return bytes([first, second])
+
+
+def attitude_packet(roll: float, pitch: float, yaw: float, time_s: float) -> bytes:
+    """Euler angles [rad] with the device's time [s]."""
+    fields = _field(_EULER_ANGLES, struct.pack(">fffH", roll, pitch, yaw, _VALID))
+    fields += _field(_GPS_TIME, struct.pack(">dHH", time_s, 0, _VALID))
+    packet = bytes([0x75, 0x65, _FILTER_SET, len(fields)]) + fields
+    return packet + checksum(packet)
+
+
+def _field(descriptor: int, data: bytes) -> bytes:
+    return bytes([len(data) + 2, descriptor]) + data

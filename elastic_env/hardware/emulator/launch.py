@@ -1,0 +1,144 @@
+"""An emulator in a process of its own, as programs and tests start it."""
+
+import json
+import subprocess
+import termios
+import time
+from contextlib import AbstractContextManager
+from typing import Any, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from elastic_env.core.config import Model, quantity
+from elastic_env.hardware.buses.packets import HIGHEST_RATE, LOWEST_RATE, RATES, require_ids
+from elastic_env.hardware.buses.servo_models import servo_model
+from elastic_env.hardware.emulator.faults import Faults
+from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.safety.processes import end_child, start_child
+from elastic_env.robots.testbed.config import TestbedConfig
+
+_END_S = 10.0
+_LONGEST_SWING_S = 10.0
+_REST_RAD_S = 0.02
+_LOOK_S = 0.05
+_STILL_LOOKS = 3  # where a swing turns back it stands still for one look
+
+
+class EmulatorConfig(Model):
+    """An emulated bus with its servos, and the IMU on the link of the first."""
+
+    model_number: int = 54024
+    """Type of the servos."""
+    claimed_model_number: int | None = None
+    """Model number that they report, if it is to be a wrong one."""
+    ids: tuple[int, ...] = (1,)
+    """Their ids."""
+    testbed: TestbedConfig = TestbedConfig()
+    """The joints behind them, and through its scenario the quality of the IMU."""
+    imu_rate_hz: float = quantity("Hz", 100.0, ge=1, le=1000, description="packets of the IMU per second")
+    baudrate: int = quantity(
+        "bit/s",
+        3_000_000,
+        ge=LOWEST_RATE,
+        le=HIGHEST_RATE,
+        description="rate of the bus; no other is heard",
+    )
+    faults: Faults = Faults()
+    seed: int = quantity("1", 0, ge=0, description="seed of faults and noise")
+
+    @model_validator(mode="after")
+    def _servos_exist(self) -> Self:
+        servo_model(self.model_number)
+        if not hasattr(termios, f"B{self.baudrate}"):
+            raise ValueError(f"a pseudo-terminal has no rate of {self.baudrate} bit/s; it has {RATES}")
+        require_ids(self.ids)
+        return self
+
+
+class RunningEmulator(AbstractContextManager["RunningEmulator"]):
+    """Starts an emulator; a context manager that ends it.
+
+    Args:
+        config: What to emulate.
+
+    Attributes:
+        port: Of the servos.
+        imu_port: Of the IMU.
+    """
+
+    def __init__(self, config: EmulatorConfig | None = None) -> None:
+        text = (config or EmulatorConfig()).model_dump_json()
+        self._process = start_child(
+            "elastic_env.hardware.emulator.process",
+            text,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        self._take_ports(self._receive())
+
+    def faults(self, **changes: Any) -> None:
+        """Switch faults on and off, see `Faults`.
+
+        A bus that is plugged in again has another port.
+        """
+        self._take_ports(self._request({"faults": changes}))
+
+    def events(self) -> list[tuple[float, int, str, int]]:
+        """Switches, goals and requests for states since the last call.
+
+        Monotonic time, id, register, value [count]; `present_position` is what a state that was
+        asked for is to tell.
+        """
+        return [(float(t), int(i), str(name), int(value)) for t, i, name, value in self._request({"events": True})]
+
+    def state(self) -> dict[str, Any]:
+        """Truth: time_s, theta and q [rad], torque_on, skipped_s."""
+        return self._request({"state": True})
+
+    def wait_until_rest(self) -> None:
+        """Wait until joints that were let go have swung out: torque goes on at rest only.
+
+        Raises:
+            HardwareError: They still move after 10 s.
+        """
+        deadline = time.monotonic() + _LONGEST_SWING_S
+        before = self.state()
+        still_looks = 0
+        while still_looks < _STILL_LOOKS:
+            if time.monotonic() > deadline:
+                raise HardwareError(f"the emulated joints still swing after {_LONGEST_SWING_S:g} s; is torque off?")
+            time.sleep(_LOOK_S)
+            now = self.state()
+            moved = np.abs(np.subtract(now["theta"], before["theta"])).max()
+            is_still = moved < _REST_RAD_S * (now["time_s"] - before["time_s"])
+            still_looks = still_looks + 1 if is_still else 0
+            before = now
+
+    def wait(self) -> None:
+        """Wait until it ends by itself, or an interrupt comes."""
+        self._process.wait()
+
+    def close(self) -> None:
+        """End it."""
+        end_child(self._process, _END_S)
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _request(self, request: dict[str, Any]) -> Any:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        return self._receive()
+
+    def _receive(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise HardwareError(f"the emulator ended with exit code {self._process.wait()}")
+        return json.loads(line)
+
+    def _take_ports(self, ports: dict[str, str]) -> None:
+        self.port = ports["port"]
+        self.imu_port = ports["imu_port"]

@@ -1,0 +1,299 @@
+"""Emulated servos and their bus: registers with their rules, and the answers of Protocol 2.0."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from elastic_env.hardware.buses import packets
+from elastic_env.hardware.buses.packets import Packet, word, words
+from elastic_env.hardware.buses.servo_models import (
+    LARGEST_TORQUE_NM,
+    Register,
+    ServoModel,
+    current_of_torque,
+)
+
+OVERLOAD = 1 << 5
+"""Bit of an overload in the hardware error status."""
+
+Notify = Callable[[int, str, int], None]
+
+_COOL_C = 35
+_HOT_C = 95
+_FIRMWARE = 38
+_SUPPLY_DV = 240
+_SWITCHES = ("torque_enable", "goal_position", "bus_watchdog")
+_WATCHDOG_UNIT_S = 0.02
+_WATCHDOG_FIRED = -1
+
+
+@dataclass
+class Motor:
+    """The motor side of a joint, as its servo measures it."""
+
+    position: float = 0.0
+    """Angle [rad]."""
+    velocity: float = 0.0
+    """Its rate [rad/s]."""
+    torque: float = 0.0
+    """Torque of the servo [N·m]."""
+
+
+@dataclass
+class EmulatedServo:
+    """One servo on an emulated bus.
+
+    Attributes:
+        servo_id: Its id.
+        model: Its type, by which its registers and units go.
+        notify: Called with id, register and value when torque, goal or watchdog change.
+        model_number: Number that it claims, if another one than its type's.
+        motor: What it measures.
+    """
+
+    servo_id: int
+    model: ServoModel
+    notify: Notify
+    model_number: int | None = None
+    motor: Motor = field(default_factory=Motor)
+    _memory: bytearray = field(init=False)
+    _registered: tuple[int, bytes] | None = None
+    _heard_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._memory = bytearray(self.model.table.size)
+        self._reset()
+
+    def _reset(self) -> None:
+        limit = self.model.current_limit
+        allowed = int(current_of_torque(LARGEST_TORQUE_NM) / self.model.current_unit)
+        for register in self.model.table.values():
+            self[register.name] = register.initial
+        self["model_number"] = self.model_number or self.model.number
+        self["firmware_version"] = _FIRMWARE
+        self["id"] = self.servo_id
+        self["return_delay_time"] = 0
+        self[limit] = min(self[limit], allowed)
+        self["present_input_voltage"] = _SUPPLY_DV
+        self.heat(False)
+
+    def __getitem__(self, name: str) -> int:
+        """Value of a register [count]."""
+        register = self.model.table[name]
+        return register.decode(self._memory[register.address : register.end])
+
+    def __setitem__(self, name: str, value: int) -> None:
+        """Set a register [count], by no rules."""
+        register = self.model.table[name]
+        self._memory[register.address : register.end] = register.encode(value)
+
+    @property
+    def is_on(self) -> bool:
+        """True if torque is on."""
+        return bool(self["torque_enable"])
+
+    @property
+    def goal(self) -> float:
+        """Goal position [rad]."""
+        return self["goal_position"] * self.model.position_unit
+
+    def measure(self) -> None:
+        """Put what it measures into its registers."""
+        self["present_position"] = round(self.motor.position / self.model.position_unit)
+        self["present_velocity"] = round(self.motor.velocity / self.model.velocity_unit)
+        self["present_current"] = round(current_of_torque(self.motor.torque) / self.model.current_unit)
+
+    def heat(self, is_hot: bool) -> None:
+        """Make it hot, which it shows as its temperature alone, or let it cool."""
+        self["present_temperature"] = _HOT_C if is_hot else _COOL_C
+
+    def overload(self, is_overloaded: bool) -> None:
+        """Begin or end an overload: the status shows it, and the servo lets go."""
+        self["hardware_error_status"] = OVERLOAD if is_overloaded else 0
+        if is_overloaded and self.is_on:
+            self._change("torque_enable", 0)
+
+    def watch(self, now_s: float) -> None:
+        """Stop where it is if the bus has been silent for longer than the watchdog allows.
+
+        Torque stays on, and no goal is taken before the watchdog is written to 0 (e-manual, Bus
+        Watchdog).
+        """
+        if not self.model.has_watchdog or self["bus_watchdog"] <= 0:
+            return
+        if now_s - self._heard_s > self["bus_watchdog"] * _WATCHDOG_UNIT_S:
+            self.measure()
+            self._change("goal_position", self["present_position"])
+            self._change("bus_watchdog", _WATCHDOG_FIRED)
+
+    def hear(self, now_s: float) -> None:
+        """Note that an instruction for anybody came over the bus."""
+        self._heard_s = now_s
+
+    def answer(self, instruction: int, parameters: bytes) -> tuple[int, bytes]:
+        """Error number and data of the reply to an instruction."""
+        match instruction:
+            case packets.PING:
+                return self._alert, word(self["model_number"]) + bytes([self["firmware_version"]])
+            case packets.READ if len(parameters) == 4:
+                return self.read(*words(parameters))
+            case packets.WRITE if len(parameters) > 2:
+                return self.write(words(parameters)[0], parameters[2:]), b""
+            case packets.REG_WRITE if len(parameters) > 2:
+                self._registered = (words(parameters)[0], parameters[2:])
+                self["registered_instruction"] = 1
+                return self._alert, b""
+            case packets.ACTION if self._registered is not None:
+                address, data = self._registered
+                self._registered = None
+                self["registered_instruction"] = 0
+                return self.write(address, data), b""
+            case packets.FACTORY_RESET | packets.REBOOT:
+                self._change("torque_enable", 0)
+                if instruction == packets.FACTORY_RESET:
+                    self._reset()
+                self["hardware_error_status"] = 0
+                return 0, b""
+            case _:
+                return packets.INSTRUCTION_ERROR | self._alert, b""
+
+    def read(self, address: int, length: int) -> tuple[int, bytes]:
+        """Error number and bytes; beyond the table there is nothing to read."""
+        if address + length > len(self._memory) or length == 0:
+            return packets.ACCESS_ERROR | self._alert, b""
+        self.measure()
+        return self._alert, bytes(self._memory[address : address + length])
+
+    def write(self, address: int, data: bytes) -> int:
+        """Write whole registers from an address on.
+
+        The error number, and then nothing is written.
+        """
+        values: dict[str, int] = {}
+        end = address + len(data)
+        while address < end:
+            register = self.model.table.find(address)
+            if register is None or not register.is_writable or register.address != address:
+                return packets.ACCESS_ERROR | self._alert
+            if register.memory == "EEPROM" and self.is_on:
+                return packets.ACCESS_ERROR | self._alert
+            if register.end > end:
+                return packets.LENGTH_ERROR | self._alert
+            value = register.decode(data[: register.size])
+            error = self._refusal(register, value)
+            if error:
+                return error | self._alert
+            values[register.name] = value
+            data = data[register.size :]
+            address = register.end
+        for name, value in values.items():
+            self._change(name, value)
+        return self._alert
+
+    def _refusal(self, register: Register, value: int) -> int:
+        """Error number of a value that the servo does not take, 0 if it does."""
+        if register.name.startswith("goal_") and self.model.has_watchdog and self["bus_watchdog"] == _WATCHDOG_FIRED:
+            return packets.RANGE_ERROR
+        match register.name:
+            case "goal_position":
+                is_within = self["min_position_limit"] <= value <= self["max_position_limit"]
+                return 0 if is_within else packets.LIMIT_ERROR
+            case "torque_enable" if value not in (0, 1):
+                return packets.RANGE_ERROR
+            case "torque_enable":
+                return packets.RESULT_FAIL if value and self["hardware_error_status"] else 0
+            case "id":
+                return 0 if 0 <= value <= packets.LARGEST_ID else packets.RANGE_ERROR
+            case _:
+                return 0
+
+    def _change(self, name: str, value: int) -> None:
+        """Store a value with all that follows from it.
+
+        A servo that gets torque keeps its goal, and runs to it: nobody says of the real ones that
+        they do not.
+        """
+        self[name] = value
+        if name == "id":
+            self.servo_id = value
+        if name in _SWITCHES:
+            self.notify(self.servo_id, name, value)
+
+    @property
+    def _alert(self) -> int:
+        return packets.ALERT if self["hardware_error_status"] else 0
+
+
+class EmulatedBus:
+    """Hands instructions to its servos, and orders what they answer as the protocol says.
+
+    Args:
+        servos: In any order.
+    """
+
+    def __init__(self, servos: Sequence[EmulatedServo]) -> None:
+        self.servos = {servo.servo_id: servo for servo in servos}
+
+    def answer(self, packet: Packet, now_s: float) -> list[bytes]:
+        """Replies to an instruction, each as it goes over the wire, in their order."""
+        for servo in self.servos.values():
+            servo.hear(now_s)
+        if not packet.is_intact:
+            return [packets.status(packet.servo_id, packets.CRC_ERROR)] if packet.servo_id in self.servos else []
+        parameters = packet.parameters
+        match packet.instruction:
+            case packets.STATUS:
+                return []
+            case packets.SYNC_READ | packets.FAST_SYNC_READ:
+                groups = [(servo_id, *words(parameters)) for servo_id in parameters[4:]]
+                return self._read(groups, packet.instruction == packets.FAST_SYNC_READ)
+            case packets.BULK_READ | packets.FAST_BULK_READ:
+                groups = [(parameters[i], *words(parameters[i + 1 :])) for i in range(0, len(parameters) - 4, 5)]
+                return self._read(groups, packet.instruction == packets.FAST_BULK_READ)
+            case packets.SYNC_WRITE:
+                address, length = words(parameters)
+                for at in range(4, len(parameters) - length, length + 1):
+                    self._write(parameters[at], address, parameters[at + 1 : at + 1 + length])
+                return []
+            case packets.BULK_WRITE:
+                while len(parameters) >= 5:
+                    address, length = words(parameters[1:])
+                    self._write(parameters[0], address, parameters[5 : 5 + length])
+                    parameters = parameters[5 + length :]
+                return []
+            case packets.PING if packet.servo_id == packets.BROADCAST:
+                return [reply for servo_id in sorted(self.servos) for reply in self._instruct(servo_id, packet)]
+            case _ if packet.servo_id == packets.BROADCAST:
+                for servo_id in list(self.servos):
+                    self._instruct(servo_id, packet)
+                return []
+            case _:
+                return self._instruct(packet.servo_id, packet)
+
+    def _instruct(self, servo_id: int, packet: Packet) -> list[bytes]:
+        servo = self.servos.get(servo_id)
+        if servo is None:
+            return []
+        error, data = servo.answer(packet.instruction, packet.parameters)
+        if servo.servo_id != servo_id:
+            self.servos[servo.servo_id] = self.servos.pop(servo_id)
+        return [packets.status(servo_id, error, data)]
+
+    def _read(self, groups: Sequence[tuple[int, int, int]], is_fast: bool) -> list[bytes]:
+        replies = [(i, *self.servos[i].read(address, length)) for i, address, length in groups if i in self.servos]
+        if not is_fast:
+            return [packets.status(servo_id, error, data) for servo_id, error, data in replies]
+        return [_join(replies)] if len(replies) == len(groups) else []
+
+    def _write(self, servo_id: int, address: int, data: bytes) -> None:
+        if servo_id in self.servos:
+            self.servos[servo_id].write(address, data)
+
+
+def _join(replies: Sequence[tuple[int, int, bytes]]) -> bytes:
+    """A fast reply: the parts of all servos in one packet, each with a checksum of all so far."""
+    length = 1 + sum(len(data) + 4 for _, _, data in replies)
+    wire = packets.HEADER + bytes([packets.BROADCAST]) + word(length) + bytes([packets.STATUS])
+    for servo_id, error, data in replies:
+        wire += bytes([error, servo_id]) + data
+        wire += word(packets.crc16(wire))
+    return wire

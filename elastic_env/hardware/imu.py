@@ -1,0 +1,241 @@
+"""The link's attitude from a MicroStrain IMU, read by a process of its own.
+
+A stream that stalls is an error.
+
+The maker's library keeps Python's lock while it waits, which would hold the control loop up, hence
+the process. The newest sample lies in shared memory with its time. A counter around each write, odd
+while it lasts, keeps halves of two samples apart.
+"""
+
+import math
+import mmap
+import os
+import struct
+import subprocess
+import time
+from contextlib import AbstractContextManager
+from dataclasses import astuple, dataclass
+from typing import Literal
+
+from elastic_env.hardware.buses.port_lock import lock_port
+from elastic_env.hardware.errors import HardwareError
+from elastic_env.hardware.safety.guard import is_outside
+from elastic_env.hardware.safety.processes import end_child, start_child
+
+Axis = Literal["roll", "pitch", "yaw"]
+
+_RANGE_RAD: dict[Axis, float] = {"roll": math.pi, "pitch": math.pi / 2.0, "yaw": math.pi}
+_ROUNDING_RAD = 1e-4  # the IMU sends 32 bits
+_COUNTER = struct.Struct("=q")
+_SAMPLE = struct.Struct("=dddd")
+_SIZE = _COUNTER.size + _SAMPLE.size
+_TRIES = 100
+_END_S = 2.0
+
+
+class AttitudeError(HardwareError):
+    """The IMU cannot be opened, is silent, or sends angles that it cannot have measured."""
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """One sample: Euler angles [rad], north-east-down, and when it came in [s, monotonic]."""
+
+    time_s: float
+    roll: float
+    pitch: float
+    yaw: float
+
+    def link_angle(self, axis: Axis, sign: int, offset_rad: float) -> float:
+        """Link angle sign · (Euler angle − offset) [rad], from −π to π.
+
+        The offset is that at q = 0.
+        """
+        return math.remainder(sign * (getattr(self, axis) - offset_rad), 2.0 * math.pi)
+
+
+class PlausibleAttitudes:
+    """Looks at attitudes, one after the other, for those that cannot have been measured.
+
+    An IMU marks as valid what its filter has computed, right or not. A filter that stands still
+    goes on sending its last angles. Those of a working one should not be equal in all bits: a
+    gyroscope of some 0.005 °/s/√Hz turns an angle by about 10 µrad from packet to packet at 100 Hz,
+    and a bit is at most 0.24 µrad. So three angles that stay the same are no newer than when they
+    first came, and have the age at which any attitude counts as missing.
+
+    Args:
+        oldest_s: Age at which an attitude counts as missing [s].
+    """
+
+    def __init__(self, oldest_s: float) -> None:
+        self._oldest_s = oldest_s
+        self._first: Attitude | None = None
+        """First sample with the angles of the last one."""
+
+    def check(self, sample: Attitude) -> str:
+        """Take the newest sample.
+
+        Returns:
+            What is wrong with it, and what to look at; "" if nothing.
+        """
+        for name, end in _RANGE_RAD.items():
+            angle = getattr(sample, name)
+            if is_outside(angle, -end - _ROUNDING_RAD, end + _ROUNDING_RAD):
+                return (
+                    f"sends {name} = {angle:g} rad and calls it valid; it must lie between "
+                    f"{-end:.4f} and {end:.4f} rad: switch the IMU off and on, and look at the "
+                    "settings of its filter"
+                )
+        if self._first is None or astuple(sample)[1:] != astuple(self._first)[1:]:
+            self._first = sample
+        same_s = sample.time_s - self._first.time_s
+        if is_outside(same_s, 0.0, self._oldest_s):
+            return (
+                f"has sent the same attitude in all bits for {1e3 * same_s:.0f} ms, "
+                f"{1e3 * self._oldest_s:.0f} ms are allowed (imu_oldest_s): its filter stands "
+                "still; switch the IMU off and on"
+            )
+        return ""
+
+
+class SharedSample:
+    """The newest sample, written by one process and read by another.
+
+    Args:
+        descriptor: File of the memory, from `SharedSample.file`.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._memory = mmap.mmap(descriptor, _SIZE)
+        self._last: Attitude | None = None
+
+    @staticmethod
+    def file() -> int:
+        """New memory for a sample."""
+        descriptor = os.memfd_create("attitude")
+        os.ftruncate(descriptor, _SIZE)
+        return descriptor
+
+    def put(self, sample: Attitude) -> None:
+        """Replace the sample."""
+        counter = self._counter()
+        _COUNTER.pack_into(self._memory, 0, counter + 1)
+        _SAMPLE.pack_into(self._memory, _COUNTER.size, *astuple(sample))
+        _COUNTER.pack_into(self._memory, 0, counter + 2)
+
+    def get(self) -> Attitude | None:
+        """The newest sample; None before the first.
+
+        Where a write does not come to its end, because its process died or waits, it is the one
+        before.
+        """
+        for _ in range(_TRIES):
+            before = self._counter()
+            values = _SAMPLE.unpack_from(self._memory, _COUNTER.size)
+            if before == self._counter() and before % 2 == 0:
+                self._last = Attitude(*values) if before else None
+                break
+        return self._last
+
+    def _counter(self) -> int:
+        return _COUNTER.unpack_from(self._memory)[0]
+
+
+class AttitudeStream(AbstractContextManager["AttitudeStream"]):
+    """Reads an IMU that streams its filter's Euler angles (MIP set 0x82, field 0x05).
+
+    Args:
+        port: Device, such as /dev/ttyACM0.
+        baudrate: Bits per second.
+        oldest_s: Age at which a sample counts as missing [s].
+        wait_s: How long to wait for the first one, with the start of the reader on a busy computer
+            [s].
+
+    Raises:
+        PortError: There is no such port, it may not be opened, or another program has it.
+        AttitudeError: Nothing comes that is an attitude.
+    """
+
+    def __init__(self, port: str, baudrate: int = 115_200, oldest_s: float = 0.05, wait_s: float = 8.0) -> None:
+        self.port = port
+        self._oldest_s = oldest_s
+        self._plausible = PlausibleAttitudes(oldest_s)
+        self._lock: int | None = lock_port(port)
+        self._process: subprocess.Popen[str] | None = None
+        try:
+            self._shared = self._start(port, baudrate)
+            deadline = time.monotonic() + wait_s
+            while self._shared.get() is None:
+                if self._process is None or self._process.poll() is not None or time.monotonic() > deadline:
+                    raise self._silence()
+                time.sleep(0.01)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, port: str, baudrate: int) -> SharedSample:
+        """Start the reader."""
+        file = SharedSample.file()
+        try:
+            self._process = start_child(
+                "elastic_env.hardware.imu_reader",
+                str(file),
+                port,
+                str(baudrate),
+                pass_fds=[file],
+                stdin=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+            )
+            return SharedSample(file)
+        finally:
+            os.close(file)
+
+    def latest(self) -> Attitude:
+        """The newest sample.
+
+        Raises:
+            AttitudeError: It is too old: the stream has stopped. Or no IMU that works can have
+                measured it.
+        """
+        sample = self._shared.get()
+        if sample is None or is_outside(time.monotonic() - sample.time_s, 0.0, self._oldest_s):
+            raise self._silence(sample)
+        problem = self._plausible.check(sample)
+        if problem:
+            raise AttitudeError(f"the IMU at {self.port} {problem}")
+        return sample
+
+    def close(self) -> None:
+        """End the reader, and give the port back; a second time does nothing."""
+        process = self._process
+        lock = self._lock
+        self._process = None
+        self._lock = None
+        try:
+            if process is not None:
+                end_child(process, _END_S)
+        finally:
+            if lock is not None:
+                os.close(lock)
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _silence(self, last: Attitude | None = None) -> AttitudeError:
+        """The error of a stream that is silent, after a last sample or from the beginning."""
+        process = self._process
+        if process is None:
+            return AttitudeError(f"the IMU at {self.port} is closed")
+        if process.poll() is not None and process.stderr is not None:
+            lines = process.stderr.read().strip().splitlines() or ["its reader ended"]
+            return AttitudeError(f"the IMU at {self.port} cannot be read: {lines[-1]}")
+        if last is None:
+            return AttitudeError(
+                f"the IMU at {self.port} sends no attitude; it must stream its filter's Euler "
+                "angles (set 0x82, field 0x05) at 100 Hz or more, at this baud rate"
+            )
+        return AttitudeError(
+            f"the IMU at {self.port} has sent no attitude for "
+            f"{1e3 * (time.monotonic() - last.time_s):.0f} ms, {1e3 * self._oldest_s:.0f} ms are "
+            "allowed (imu_oldest_s); look at its cable and its data rate"
+        )

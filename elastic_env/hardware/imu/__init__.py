@@ -1,1 +1,0 @@
-"""The IMU on the link, read in a process of its own."""
