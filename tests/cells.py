@@ -8,7 +8,7 @@ import numpy as np
 
 from baselines.residual.residual import ResidualDescription
 from train.evaluate.conditions import Condition, Member, PolicySpec
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 
 METRIC = "pelvis_error_rms_rad"
 

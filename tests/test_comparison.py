@@ -26,7 +26,7 @@ from tests.cells import METRIC, cell, describe, family, records
 from train.commands.cli import main
 from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
 from train.evaluate.conditions import Condition, Member, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.families import expand
 from train.evaluate.progress import learning_curves
 from train.evaluate.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair

@@ -21,7 +21,7 @@ from tests.cells import METRIC, cell, family
 from train.commands.cli import main
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.leaderboard import Paired, Standing, standings
 from train.evaluate.statistics import Estimate, over_seeds
 from train.experiments.compare import CompareConfig, Sweep

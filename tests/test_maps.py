@@ -17,8 +17,9 @@ from elastic_env.runtime.scenario import make_scenario
 from tests.cells import METRIC, cell, family
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, varied
-from train.evaluate.evaluate import Evaluation, make_vector_env
+from train.evaluate.episodes import Evaluation
 from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
+from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
 from train.experiments.compare import CompareConfig
 from train.figures.figures import draw_maps

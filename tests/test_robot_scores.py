@@ -18,9 +18,10 @@ from elastic_env.runtime.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, family, records
 from train.evaluate.changes import HELD_OUT, changes
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import evaluate, make_vector_env
+from train.evaluate.episodes import evaluate
 from train.evaluate.families import Origin
 from train.evaluate.robots import robot_scores
+from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
 from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds

@@ -24,7 +24,8 @@ from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.runtime.robot_model import WalkerModel
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate, make_vector_env
+from train.evaluate.episodes import Evaluation, evaluate
+from train.evaluate.rollout import make_vector_env
 from train.evaluate.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.experiments.compare import CompareConfig, try_out
 from train.figures.figures import figure_name, option_curves, reference_curves

@@ -7,7 +7,7 @@ from scipy.stats import bootstrap
 
 from docs.pages.cells import Rows, minus
 from elastic_env.core.signals import Array
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
 from train.runs.escaping import markdown_table
 
 _FIRST = "panda"
@@ -31,7 +31,7 @@ def one_arm(gallery: Rows) -> str:
 def link_encoders(episodes: Rows) -> str:
     """What encoders on the links of an arm are worth: error of the end effector, episode by episode."""
     rows = []
-    for scenario, own in grouped(episodes, lambda row: row["scenario"]).items():
+    for scenario, own in group_by(episodes, lambda row: row["scenario"]).items():
         errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES}
         base, other = (errors[policy] for policy in _POLICIES)
         ends = bootstrap(
@@ -53,8 +53,8 @@ def _percent(value: float | Array) -> str:
 
 def arm_identification(rows: Rows) -> str:
     """How well the stiffness of an arm is found over many logs of known truth, from `tests.identification_trials`."""
-    kinds = grouped(rows, lambda row: (row["poses"], row["log"]))
-    joints = grouped(rows, lambda row: row["joint"])
+    kinds = group_by(rows, lambda row: (row["poses"], row["log"]))
+    joints = group_by(rows, lambda row: row["joint"])
     head = ["", *(f"{poses} poses, {log}" for poses, log in kinds)]
     counted = [[f"`{joint}`", *(_counted(row) for row in own)] for joint, own in joints.items()]
     arm = [own[0] for own in kinds.values()]

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
 from train.runs.escaping import write_csv
 
 Rows = Sequence[Mapping[str, str]]
@@ -71,7 +71,7 @@ def condensed(episodes: Rows, kept: Kept) -> Iterator[list[object]]:
     """Head and rows of the table that is kept of the episodes of a comparison."""
     yield [*_PLACE, "statistic", "episodes", "failed", *kept.metrics]
     played = [row for row in episodes if all(row[name] in own for name, own in kept.only.items())]
-    for names, own in grouped(played, lambda row: tuple(row[name] for name in _PLACE)).items():
+    for names, own in group_by(played, lambda row: tuple(row[name] for name in _PLACE)).items():
         stood = [row for row in own if not row["termination"]]
         for statistic in kept.statistics:
             values = (_over([row[m] for row in stood], _STATISTICS[statistic]) for m in kept.metrics)

@@ -21,7 +21,7 @@ from rich.console import Console  # noqa: E402
 
 from elastic_env.rendering.picture import Image, with_text  # noqa: E402
 from train.evaluate.conditions import Condition, PolicySpec  # noqa: E402
-from train.evaluate.evaluate import make_policy  # noqa: E402
+from train.evaluate.rollout import make_policy  # noqa: E402
 from train.experiments.play import episode  # noqa: E402
 from train.experiments.robot import RobotTrial, robot_arguments  # noqa: E402
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from docs.pages.cells import Rows
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.changes import BEST_ANALYTIC, FEWEST_SEEDS, percent, percent_interval, signed_off
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
 from train.evaluate.statistics import Estimate
 from train.runs.escaping import markdown_table
 
@@ -121,7 +121,7 @@ def changes_table(
     titles = {metric: _METRICS[metric] for metric in metrics if any(row["metric"] == metric for row in own)}
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
     lines = []
-    for place, found in grouped(own, lambda row: (*(row[name] for name in names), row["scope"])).items():
+    for place, found in group_by(own, lambda row: (*(row[name] for name in names), row["scope"])).items():
         by_metric = {row["metric"]: row for row in found}
         cells = (part for metric, (_, unit) in titles.items() for part in _over_base(by_metric[metric], unit))
         lines.append([*place[:-1], _scope(found[0]), *cells])

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from docs.pages.cells import Rows
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
 from train.evaluate.leaderboard import Standing
 from train.runs.escaping import markdown_table
 
@@ -15,7 +15,7 @@ def vector_environments(*tables: Rows) -> str:
     lines = []
     rows = [row for table in tables for row in table if row["against"] == f"{_RAW}, {row['num_envs']}"]
     rows = sorted(rows, key=lambda row: int(row["num_envs"]))
-    for (env, worlds), own in sorted(grouped(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot):
+    for (env, worlds), own in sorted(group_by(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot):
         ratios = [f"{float(row['ratio']):.2f}" for row in own if row["contender"].startswith(_OURS)]
         (raw, *_) = (row for row in own if row["contender"] == _RAW)
         if ratios:  # the scalar environment has raw physics of its own

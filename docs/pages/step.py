@@ -14,7 +14,7 @@ from rich.console import Console
 
 from docs.pages.step_picture import CHARTS, WITH, WITHOUT
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import make_policy
+from train.evaluate.rollout import make_policy
 from train.experiments.play import episode
 from train.runs.escaping import write_records
 

@@ -11,16 +11,8 @@ from elastic_env.core.errors import ElasticError
 from train.cells.key import cell_key
 from train.cells.store import Store, UnfitCellError
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import (
-    MOST_WORLDS,
-    Evaluation,
-    PolicyFailedError,
-    evaluate,
-    evaluate_together,
-    in_common,
-    num_steps,
-    plays_beside_others,
-)
+from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
+from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
 from train.runs.failures import DEFECT, explained
 from train.runs.progress import Show, plain_progress, show_progress
 from train.runs.warned import each_once, said_so_far
@@ -183,11 +175,11 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     batches: list[list[int]] = []
     open_batch: dict[str, tuple[list[int], int]] = {}
     for number, condition in enumerate(conditions):
-        if not plays_beside_others(condition):
+        if not can_share_worlds(condition):
             batches.append([number])
             continue
         policy = condition.policy, condition.member, condition.policy_options, condition.reference_name
-        key = repr((policy, in_common(condition)))
+        key = repr((policy, shared_settings(condition)))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
             batch, size = [], 0

@@ -20,7 +20,7 @@ from elastic_env.core.errors import ElasticError, shown
 from elastic_env.core.files import read_bounded, write_whole
 from train.cells.key import cell_key
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import Evaluation, words_of
+from train.evaluate.episodes import Evaluation, episode_labels
 
 CELLS = "cells"
 """Folder of a run in which its finished cells are."""
@@ -156,7 +156,7 @@ def _episodes(condition: Condition, text: npt.NDArray[Any]) -> list[dict[str, An
 
 
 def _require_record(condition: Condition, number: int, record: dict[str, Any]) -> None:
-    for name, value in words_of(condition, number).items():
+    for name, value in episode_labels(condition, number).items():
         own = record.get(name)
         same = type(own) is type(value) and own == value
         _require(same, f"{name} of episode {number} is {shown(own)}, in the cell it is {shown(value)}")

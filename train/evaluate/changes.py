@@ -13,7 +13,7 @@ from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
 from train.evaluate.conditions import Condition, Member
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.families import Origin, origin
 from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, pair
 
@@ -262,7 +262,7 @@ def level(members: Sequence[Evaluation], column: Column) -> Estimate:
 
 def by_cell(evaluations: Sequence[Evaluation]) -> dict[tuple[object, ...], list[Evaluation]]:
     """Evaluations of a policy by reference, scenario and swept values: one per training seed."""
-    return grouped(evaluations, lambda e: e.condition.cell)
+    return group_by(evaluations, lambda e: e.condition.cell)
 
 
 def _against(own: Sequence[Evaluation], base: Sequence[Evaluation], trained: Origin | None, groups: Groups
@@ -379,5 +379,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = grouped(rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items()))
+    lines = group_by(rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items()))
     return list(lines.values())

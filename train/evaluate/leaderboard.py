@@ -10,7 +10,7 @@ from baselines.catalogue import Track
 from train.evaluate.changes import Change, Groups, by_cell, paired
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import best_of, failed_of
 from train.evaluate.statistics import Estimate, over_seeds
 
@@ -90,7 +90,7 @@ def standings(
         step_us: Time per step of every policy, by its title.
     """
     scopes = _scopes(evaluations, groups)
-    rivals = grouped([s for s in scopes if s.first.track is Track.STANDARD], lambda s: s.name)
+    rivals = group_by([s for s in scopes if s.first.track is Track.STANDARD], lambda s: s.name)
     return [
         _standing(scope, column, changes, rivals.get(scope.name, []), step_us)
         for scope in scopes

@@ -17,7 +17,7 @@ from elastic_env.runtime.scenario import GROUNDS
 from train.evaluate.changes import Change, families, level, paired
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 
 _UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}
@@ -186,7 +186,7 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
 
     return [
         _heat_map(title, own, config, column)
-        for title, own in grouped(evaluations, title_of).items()
+        for title, own in group_by(evaluations, title_of).items()
         for column in own[0].condition.environment.judged
     ]
 
@@ -212,7 +212,7 @@ def failed_of(members: Sequence[Evaluation]) -> tuple[int, int]:
 
 
 def _heat_map(title: str, evaluations: Sequence[Evaluation], config: MapConfig, column: Column) -> HeatMap:
-    cells = grouped(evaluations, lambda e: (config.y.place(e.condition), config.x.place(e.condition)))
+    cells = group_by(evaluations, lambda e: (config.y.place(e.condition), config.x.place(e.condition)))
     known = evaluations[0].condition.environment
     return HeatMap(
         title=title, column=column, x=config.x, y=config.y, known=known,
@@ -227,7 +227,7 @@ def _heat_map(title: str, evaluations: Sequence[Evaluation], config: MapConfig, 
 
 def _cell(evaluations: Sequence[Evaluation], column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
-    policies = grouped(evaluations, lambda e: e.condition.policy.title)
+    policies = group_by(evaluations, lambda e: e.condition.policy.title)
     scores = {title: (level(own, column), failed_of(own)) for title, own in policies.items()}
     tracks = {title: own[0].condition.track for title, own in policies.items()}
     analytic = best_of({title: scored for title, scored in scores.items() if tracks[title] is Track.STANDARD})

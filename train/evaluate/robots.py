@@ -9,7 +9,7 @@ from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
 from train.evaluate.changes import by_cell, opponents
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import failed_of
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
 
@@ -54,7 +54,7 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     """
     found = []
     others = opponents(evaluations)
-    policies = {title: by_cell(own) for title, own in grouped(evaluations, lambda e: e.condition.policy.title).items()}
+    policies = {title: by_cell(own) for title, own in group_by(evaluations, lambda e: e.condition.policy.title).items()}
     for title, cells in policies.items():
         for cell, members in cells.items():
             reference, scenario, *swept = cell

@@ -17,11 +17,12 @@ from train.cells.store import CELLS, Store
 from train.evaluate.changes import changes, merged
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import Environment, Reference, environment
-from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
+from train.evaluate.episodes import Evaluation
 from train.evaluate.families import expand
 from train.evaluate.leaderboard import standings
 from train.evaluate.maps import MapConfig, heat_maps
 from train.evaluate.robots import robot_scores
+from train.evaluate.rollout import make_policy, single_world_envs
 from train.experiments.timing import step_times
 from train.figures import plots
 from train.figures.figures import draw_figures, draw_maps
@@ -357,7 +358,7 @@ def _require_each_once(what: str, values: Sequence[object]) -> None:
 
 def try_out(conditions: Sequence[Condition]) -> None:
     """Make environments and policies once, so that a wrong name fails before anything runs."""
-    for condition, env in with_one_world(_each_once(conditions)):
+    for condition, env in single_world_envs(_each_once(conditions)):
         try:
             policy = make_policy(condition.policy, env, condition.policy_options)
         except ConfigurationError as error:

@@ -12,7 +12,8 @@ import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import make_gravity
 from train.cells.play import run_conditions
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.evaluate import Evaluation, make_vector_env
+from train.evaluate.episodes import Evaluation
+from train.evaluate.rollout import make_vector_env
 from train.experiments.compare import CompareConfig
 from train.figures import plots
 from train.figures.figures import cells, draw_figure

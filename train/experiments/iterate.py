@@ -21,7 +21,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.runtime.robot_model import WalkerModel
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import Column, environment
-from train.evaluate.evaluate import make_policy, make_vector_env
+from train.evaluate.rollout import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.learning_plots import draw_trials
 from train.runs.escaping import write_records

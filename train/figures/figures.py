@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from train.evaluate.environments import Environment
-from train.evaluate.evaluate import Evaluation, grouped, make_vector_env
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.maps import HeatMap
+from train.evaluate.rollout import make_vector_env
 from train.figures.map_plots import draw_map
 from train.figures.plots import draw_overview
 from train.figures.sweep_plots import Curve, draw_sweep
@@ -69,7 +70,7 @@ def figure_name(name: str, evaluation: Evaluation) -> str:
 
 def cells(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
     """Evaluations of the same reference and scenario together."""
-    return list(grouped(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values())
+    return list(group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values())
 
 
 def option_curves(evaluations: Sequence[Evaluation]) -> list[Curve]:
@@ -96,7 +97,7 @@ def _draw_reference_sweeps(evaluations: Sequence[Evaluation], known: Environment
 
 
 def _by_policy(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
-    return grouped(evaluations, lambda e: e.condition.policy.title)
+    return group_by(evaluations, lambda e: e.condition.policy.title)
 
 
 def _stem(evaluation: Evaluation) -> str:
@@ -122,7 +123,7 @@ _FIGURES: dict[str, Draw] = {
 
 def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
     """Scenarios in which the references that are played are points of one axis."""
-    by_scenario = grouped(evaluations, lambda e: e.condition.scenario)
+    by_scenario = group_by(evaluations, lambda e: e.condition.scenario)
     return [scenario for scenario, own in by_scenario.items() if has_swept_references(own)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 
 MRAD, MM = 1e3, 1e3
 """Factors from rad and m to what figures show."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.figures.plots import colours, columns_of, line_style, require_matplotlib, save
 
 

@@ -10,7 +10,7 @@ from baselines.identification.identify import Identification
 from baselines.identification.static_points import StaticPoints, link_torque
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import RobotModel
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.figures.plots import MRAD, colours, require_matplotlib, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}

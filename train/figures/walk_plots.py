@@ -11,7 +11,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.figures.plots import FAILED, MM, MRAD, colours, columns_of, line_style, require_matplotlib, save
 
 _SHADE = "#e9ebee"

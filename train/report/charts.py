@@ -7,7 +7,7 @@ import numpy as np
 
 from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.evaluate.statistics import Estimate
 from train.report.parts import (
     INK,

@@ -6,7 +6,7 @@ import numpy as np
 
 from train.evaluate.changes import level
 from train.evaluate.environments import Column, TracedSignal
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.evaluate.progress import Curves
 from train.figures.plots import line_style
 from train.figures.walk_plots import intervals

@@ -18,7 +18,7 @@ from elastic_env.core.errors import ConfigurationError, shortened
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
 from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
 from train.evaluate.statistics import Estimate
@@ -181,7 +181,7 @@ def paired_rows(found: Sequence[Standing]) -> tuple[list[str], list[list[str]]]:
             f"{scope}, {reference}",
             *(text for s in own for text in (said(s.base), _said_beside(s.rival, s.base))),
         ]
-        for (policy, scope, reference), own in grouped(learned, lambda s: (s.policy, s.scope, s.reference)).items()
+        for (policy, scope, reference), own in group_by(learned, lambda s: (s.policy, s.scope, s.reference)).items()
     ]
     changes = (f"{title}, against {other}" for title in titles for other in ("its base", f"the {BEST_ANALYTIC}"))
     return ["residual", "where", *changes], rows

@@ -10,7 +10,7 @@ import numpy as np
 
 from elastic_env.core.signals import Array
 from train.evaluate.environments import Column, Environment, TracedSignal
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.evaluate.statistics import Estimate
 from train.figures.plots import colours
 

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.report.fitting import print_fitting
 from train.runs.escaping import markdown_table, markdown_text, write_records
 

@@ -26,7 +26,7 @@ from train.evaluate.changes import (
     percent_interval,
 )
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.families import Origin
 from train.evaluate.leaderboard import Standing
 from train.evaluate.maps import HeatMap, best_of, failed_of
@@ -124,7 +124,7 @@ def summary(results: Results) -> str:
 def _ends(results: Results) -> tuple[str, str]:
     """Sentences on the best and the worst policy by the first judged metric; one that fails less often is better."""
     column = results.lines.environment.judged[0]
-    played = grouped(results.evaluations, lambda e: e.condition.policy.title)
+    played = group_by(results.evaluations, lambda e: e.condition.policy.title)
     scores = {title: (_mean_of_cells(own, column), failed_of(own)) for title, own in played.items()}
     best = best_of(scores)
     if best is None:
@@ -141,8 +141,8 @@ def _ends(results: Results) -> tuple[str, str]:
 def _cells_ahead(evaluations: Sequence[Evaluation], policy: str, column: Column) -> list[bool]:
     """Whether a policy is the best by a metric, for every cell of motion, scenario and swept value."""
     ahead = []
-    for cell in grouped(evaluations, lambda e: e.condition.cell).values():
-        played = grouped(cell, lambda e: e.condition.policy.title)
+    for cell in group_by(evaluations, lambda e: e.condition.cell).values():
+        played = group_by(cell, lambda e: e.condition.policy.title)
         ahead.append(best_of({t: (_mean_of_cells(own, column), failed_of(own)) for t, own in played.items()}) == policy)
     return ahead
 

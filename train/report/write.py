@@ -6,7 +6,7 @@ from pathlib import Path
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import SIGNS_ARE, by_line
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
 from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
 from train.report.charts import forest, ladder
@@ -196,14 +196,14 @@ def _add_sweeps(page: Page, results: Results) -> None:
             for scenario in lines.scenarios:
                 cells = {t: lines.cell(t, reference_name=reference, scenario=scenario) for t in lines.titles}
                 points = {
-                    t: grouped(own, lambda e: next(iter(e.condition.swept.values()), None)) for t, own in cells.items()
+                    t: group_by(own, lambda e: next(iter(e.condition.swept.values()), None)) for t, own in cells.items()
                 }
                 charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
     else:
         for scenario in swept_scenarios(results.evaluations):
             cells = {t: lines.cell(t, scenario=scenario) for t in lines.titles}
             points = {
-                t: grouped((e for e in own if e.condition.number is not None), lambda e: e.condition.number)
+                t: group_by((e for e in own if e.condition.number is not None), lambda e: e.condition.number)
                 for t, own in cells.items()
             }
             charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
