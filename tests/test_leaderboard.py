@@ -22,7 +22,7 @@ from train.commands.cli import main
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.evaluate.leaderboard import Paired, Standing, standings
+from train.evaluate.standings import Paired, Standing, standings
 from train.evaluate.statistics import Estimate, over_seeds
 from train.experiments.compare import CompareConfig, Sweep
 from train.experiments.timing import step_times

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from docs.pages.cells import Rows
 from train.evaluate.episodes import group_by
-from train.evaluate.leaderboard import Standing
+from train.evaluate.standings import Standing
 from train.runs.escaping import markdown_table
 
 _RAW, _OURS = "raw mj_step", "vector env"

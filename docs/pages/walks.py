@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from docs.pages.cells import Cells, Rows, failed, minus, scaled, shown
-from train.evaluate.leaderboard import Standing
+from train.evaluate.standings import Standing
 from train.runs.escaping import markdown_table
 
 PELVIS, ZMP = "pelvis_error_rms_rad", "zmp_deviation_rms_m"

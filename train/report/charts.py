@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
+from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, percent_interval
 from train.evaluate.environments import Column
 from train.evaluate.episodes import Evaluation
 from train.evaluate.statistics import Estimate
@@ -22,6 +22,7 @@ from train.report.parts import (
     domain,
     error_bars,
     layout_of,
+    level,
     note,
     nth,
     number_interval,

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from train.evaluate.changes import level
 from train.evaluate.environments import Column, TracedSignal
 from train.evaluate.episodes import Evaluation
 from train.evaluate.progress import Curves
@@ -25,6 +24,7 @@ from train.report.parts import (
     digits,
     domain,
     layout_of,
+    level,
     nth,
     numbers,
     range_of,

@@ -19,8 +19,8 @@ from elastic_env.core.files import write_whole
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS_ARE, signed_interval
 from train.evaluate.environments import Column
 from train.evaluate.episodes import group_by
-from train.evaluate.leaderboard import Paired, Standing
 from train.evaluate.maps import best_of
+from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
 from train.report.fitting import print_fitting
 from train.runs.escaping import markdown_table, markdown_text, write_csv

@@ -8,8 +8,8 @@ from train.evaluate.changes import Change, by_line, percent_interval
 from train.figures.map_plots import in_rows, panels
 from train.report.changes_tables import falls
 from train.report.leaderboard import leaderboard_markdown
-from train.report.robots_tables import ROBOTS, WORDS, robots_table
-from train.report.words import SCORES, Results, in_short, marked, notes, scores, what
+from train.report.report_text import SCORES, Results, facts, in_short, marked, notes
+from train.report.robots_tables import ROBOTS, WORDS, robots_table, scores_table
 from train.runs.escaping import markdown_table, markdown_text
 
 
@@ -17,7 +17,7 @@ def markdown(results: Results) -> str:
     """A whole report."""
     parts = [
         f"# Comparison: {markdown_text(results.name)}",
-        _bullets(f"{term}: {text}" for term, text in what(results)),
+        _bullets(f"{term}: {text}" for term, text in facts(results)),
     ]
     parts += ["## In short", _bullets(in_short(results))]
     if results.standings:
@@ -30,13 +30,13 @@ def markdown(results: Results) -> str:
             parts += [markdown_text(f"{panel.title}{key and f' ({key})'}:"), _markdown_table(head, rows, words=1)]
     for title, rows in results.grouped_changes.items():
         if rows:
-            parts += [f"## {title}", _changes_markdown(rows, results.swept_options)]
+            parts += [f"## {title}", _changes_markdown(rows, results.table.swept)]
     if results.robots:
         head, rows = robots_table(results.robots)
         parts += ["## Drawn robots", ROBOTS, _markdown_table(head, rows, words=WORDS, last_is_words=True)]
-    for title, columns in results.lines.environment.splits:
-        head, rows = scores(results, columns)
-        parts += [f"## {title}", SCORES, _markdown_table(head, rows, words=3 + len(results.swept_options))]
+    for title, columns in results.environment.splits:
+        head, rows = scores_table(results.table, columns)
+        parts += [f"## {title}", SCORES, _markdown_table(head, rows, words=3 + len(results.table.swept))]
     if results.learning:
         parts += ["## Learning curves", _learning_markdown(results)]
     parts += ["## Notes", _bullets(notes(results))]
@@ -71,7 +71,7 @@ def _learning_markdown(results: Results) -> str:
     head = ["residual", "metric", "decisions", "median", "best", "worst"]
     rows = []
     for title, curves in results.learning.items():
-        for column in results.lines.environment.judged:
+        for column in results.environment.judged:
             for at, ratio in zip(curves.decisions, curves.ratios[column.metric].T, strict=True):
                 known = ratio[np.isfinite(ratio)]
                 values = (np.median(known), known.min(), known.max()) if len(known) else (np.nan,) * 3

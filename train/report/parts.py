@@ -12,6 +12,7 @@ from elastic_env.core.signals import Array
 from train.evaluate.environments import Column, Environment, TracedSignal
 from train.evaluate.episodes import Evaluation
 from train.evaluate.statistics import Estimate
+from train.evaluate.table import EpisodeTable, score
 from train.figures.plots import colours
 
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
@@ -65,6 +66,11 @@ class Chart:
 
     spec: Spec
     height: int
+
+
+def level(cell: Sequence[Evaluation], column: Column) -> Estimate:
+    """Score of a policy in a cell."""
+    return score(EpisodeTable(cell).rows, column)
 
 
 def number_interval(estimate: Estimate, column: Column) -> str:

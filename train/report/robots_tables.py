@@ -12,6 +12,7 @@ from rich.table import Table
 from train.evaluate.changes import percent_interval
 from train.evaluate.environments import Column
 from train.evaluate.robots import RobotScores
+from train.evaluate.table import EpisodeTable, score
 from train.report.parts import number_interval
 from train.runs.escaping import write_csv
 
@@ -87,3 +88,19 @@ _HEAD = (
     "interquartile_mean_low", "interquartile_mean_high", "worst_tenth", "worst_tenth_low", "worst_tenth_high",
     "failed", "episodes", "against", "better_share", "better_share_low", "better_share_high",
 )  # fmt: skip
+
+
+def scores_table(table: EpisodeTable, columns: Sequence[Column]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of a table of scores."""
+    head = ["reference", "scenario", "policy", *table.swept, *(column.label for column in columns)]
+    rows = []
+    for reference in table.references:
+        for scenario in table.scenarios:
+            for policy in table.policies:
+                for cell in table.cells_of(policy, reference, scenario):
+                    own = table.of(policy, cell)
+                    swept = table.conditions[policy, cell].swept
+                    values = [f"{swept[name]:g}" if name in swept else "-" for name in table.swept]
+                    figures = [number_interval(score(own, c).scaled(c.scale), c) for c in columns]
+                    rows.append([reference, scenario, policy, *values, *figures])
+    return head, rows

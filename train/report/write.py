@@ -14,8 +14,8 @@ from train.report.curves import learning, over_time, sweep
 from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
-from train.report.robots_tables import ROBOTS, WORDS, robots_table
-from train.report.words import SCORES, Results, capital, in_short, notes, scores, summary, what
+from train.report.report_text import SCORES, Results, capital, facts, headline, in_short, notes
+from train.report.robots_tables import ROBOTS, WORDS, robots_table, scores_table
 
 _LONG = 40
 """Rows from which on a table is folded away."""
@@ -43,10 +43,10 @@ def write_report(results: Results) -> list[Path]:
 
 
 def _page(results: Results) -> Page:
-    known = results.lines.environment
+    known = results.environment
     page = Page(f"Comparison: {results.name}", f"{capital(known.subject)}; made {results.metadata['created'][:10]}")
-    page.section("What was compared", summary(results))
-    page.add("definitions", what(results))
+    page.section("What was compared", headline(results))
+    page.add("definitions", facts(results))
     page.add("bullets", in_short(results))
     _add_leaderboard(page, results)
     _add_maps(page, results)
@@ -107,7 +107,7 @@ def _add_maps(page: Page, results: Results) -> None:
 def _add_ladder(page: Page, results: Results) -> None:
     seeds = (
         " Diamonds are residuals: interquartile mean over training seeds with its 95 % interval."
-        if results.families else ""
+        if results.table.members else ""
     )  # fmt: skip
     page.section(
         "Ladder of policies",
@@ -116,14 +116,14 @@ def _add_ladder(page: Page, results: Results) -> None:
     references = results.lines.references
     for number, reference in enumerate(references):
         chart = ladder(results.lines, reference)
-        title = results.lines.environment.title(reference)
+        title = results.environment.title(reference)
         page.add("chart", chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
 
 
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
     *of_residuals, (name_of_others, others) = results.grouped_changes.items()
-    more = {"colour": results.lines.colour, "swept": results.swept_options}
+    more = {"colour": results.lines.colour, "swept": results.table.swept}
     for name, rows in of_residuals:
         if not rows:
             continue
@@ -167,14 +167,15 @@ def _if_long(title: str, rows: Sequence[object]) -> str | None:
 
 
 def _add_phases(page: Page, results: Results) -> None:
-    for title, columns in results.lines.environment.splits:
+    for title, columns in results.environment.splits:
         page.section(title, SCORES)
-        _add_table(page, scores(results, columns), words=3 + len(results.swept_options))
+        _add_table(page, scores_table(results.table, columns), words=3 + len(results.table.swept))
 
 
 def _add_curves(page: Page, results: Results) -> None:
-    band = " Of residuals: median over training seeds, band from the least to the most." if results.families else ""
-    shade = " Single support is shaded." if results.lines.environment.splits else ""
+    seeds = " Of residuals: median over training seeds, band from the least to the most."
+    band = seeds if results.table.members else ""
+    shade = " Single support is shaded." if results.environment.splits else ""
     text = f"The first episode of every cell; a line ends where the episode does.{band}{shade}"
     page.section("Curves over time", text)
     first = True
@@ -182,7 +183,7 @@ def _add_curves(page: Page, results: Results) -> None:
         for scenario in results.lines.scenarios:
             chart = over_time(results.lines, reference, scenario)
             if chart is not None:
-                title = f"{results.lines.environment.title(reference)}, {scenario}"
+                title = f"{results.environment.title(reference)}, {scenario}"
                 page.add("chart", chart, folded=capital(title), is_open=first)
                 first = False
 
@@ -212,7 +213,7 @@ def _add_sweeps(page: Page, results: Results) -> None:
     page.section(
         "Sweeps",
         "Means over the episodes that reached the end. A cross on top: all episodes of a policy failed there; an "
-        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.families else ""),
+        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.table.members else ""),
     )
     for number, (title, points, label) in enumerate(charts):
         chart = sweep(lines, {t: own for t, own in points.items() if own}, label)
