@@ -34,8 +34,9 @@ from train.evaluate.table import EpisodeTable, score
 from train.experiments.compare import CompareConfig, _each_once
 from train.figures.figures import has_swept_references
 from train.report import Results, require_jinja2, require_plotly, write_report
-from train.report.changes_tables import changes_table, print_changes, write_statistics
+from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page
+from train.report.render import render
 from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
@@ -261,7 +262,7 @@ def test_a_group_without_a_pair_in_one_of_its_scenarios_has_no_figures() -> None
     assert pooled.sentence.startswith("nothing to compare: in one of the scenarios there is no episode in which both")
     page = Page("x", "")
     page.section("Changes")
-    page.add("changes", {"lines": [[pooled]], "colour": {"learned": "red"}, "swept": []})
+    page.add("table", changes_table([pooled], {"learned": "red"}))
     assert "nan" not in (html := page.html(plotly_js=""))
     assert pooled.sentence in html
 
@@ -702,7 +703,7 @@ def test_tables_tell_falls_and_intervals_that_include_zero() -> None:
     for seeds, expected in ((few, "? "), ([*few, [1.0, 1.0], [3.0, 3.0]], "* ")):
         rows = changes([base, *family(seeds)])
         console = Console(width=160, record=True, file=StringIO())
-        console.print(changes_table([row for row in rows if row.is_family]))
+        console.print(render(cells_table([row for row in rows if row.is_family]), "terminal"))
         text = console.export_text()
         assert f"! 1/{2 * len(seeds)} (0/2)" in text
         row = next(row for row in rows if row.is_family and row.is_judged)

@@ -25,7 +25,7 @@ from train.experiments.compare import CompareConfig
 from train.figures.figures import draw_maps
 from train.figures.map_plots import Square, blended, panels
 from train.report import Results, write_report
-from train.report.changes_tables import write_maps
+from train.report.change_tables import write_maps
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"

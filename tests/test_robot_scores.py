@@ -26,7 +26,7 @@ from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, 
 from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds
 from train.report import Results, write_report
-from train.report.robots_tables import print_robots, robots_table, write_robots
+from train.report.score_tables import print_robots, robots_table, write_robots
 from train.runs.folders import run_folder
 
 OWN = {"load_kg": [0.0, 2.0]}
@@ -113,8 +113,8 @@ def test_file_and_tables_say_what_was_found(tmp_path: Path) -> None:
     assert found == pytest.approx([5e-3, 4e-3, 14e-3])
     better = [row["better_share"] for row in written if row["metric"] == METRIC and row["against"] == "base"]
     assert better == ["1.0"]
-    head, table = robots_table(rows)
-    shown = dict(zip(head, table[0], strict=True))
+    table = robots_table(rows)
+    shown = {head.title: cell for head, cell in zip(table.heads, table.rows[0].cells, strict=True)}
     assert [shown[name] for name in ("mean", "interquartile mean", "worst tenth", "falls")] == [
         "5.00", "4.00", "14.00", "0/10",
     ]  # fmt: skip

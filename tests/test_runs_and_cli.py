@@ -323,7 +323,7 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
         for reason, value in (("", 0.001), ("diverged", 9.0), ("", 0.003), ("diverged", float("nan")))
     ]
     table = Console(width=160, record=True, file=StringIO())
-    table.print(train.report.summary.summary_table([Evaluation(condition(), episodes)]))
+    train.report.summary.print_summary([Evaluation(condition(), episodes)], table)
     row = next(line for line in table.export_text().splitlines() if "input" in line)
     assert "2.00" in row
     assert "2/4" in row

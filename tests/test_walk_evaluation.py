@@ -32,7 +32,7 @@ from train.figures.figures import figure_name, option_curves, reference_curves
 from train.figures.sweep_plots import draw_sweep
 from train.figures.walk_plots import draw_pelvis, draw_zmp, intervals
 from train.learn.train_config import TrainConfig
-from train.report.summary import failure_notes, print_summary, summary_table, write_summary
+from train.report.summary import failure_notes, print_summary, write_summary
 from train.speed.contenders import RawWorlds, VectorLoop
 
 SHORT = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
@@ -232,7 +232,7 @@ def test_a_fall_is_counted_and_not_scored(fallen: Evaluation) -> None:
     assert fallen.trace["time_s"][-1] == pytest.approx(fallen.episodes[0]["duration_s"])
     assert fallen.trace["time_s"][-1] < 4.5
     table = Console(width=160, record=True, file=StringIO())
-    table.print(summary_table([fallen]))
+    print_summary([fallen], table)
     row = next(line for line in table.export_text().splitlines() if "zero" in line)
     assert row.split()[-1] == "1/1"
     assert not any(character.isdigit() for character in row.split("zero")[1].replace("1/1", ""))

@@ -5,7 +5,7 @@ Every baseline is compared with the base of the residuals, or without residuals 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -41,6 +41,7 @@ _SMALL = 0.0995
 _LEAST = 0.005
 """Below it a bound would look like zero without one."""
 
+Verdict = Literal["lower", "higher", "none", "unclear"]
 Groups = Mapping[str, Sequence[str]]
 
 
@@ -104,7 +105,7 @@ class Change:
         return int(np.isfinite(self.per_seed).sum())
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
         """lower, higher, none (the interval includes zero), or unclear (too few training seeds to say)."""
         low, high = self.relative.low, self.relative.high
         if low is None or high is None or self.num_compared < FEWEST_SEEDS:
@@ -271,17 +272,20 @@ class Pairing:
             mine = self.table.of(self.policy, cell)
             base = self.table.of(self.base, self.cells[cell])
             both = pair(mine, base, metric)
-            self._pairs[cell, metric] = pd.DataFrame(
-                [
+            figures = []
+            for member in mine["member"].unique():
+                own = both[both["member"] == member]
+                ours = np.asarray(own["mine"])
+                theirs = np.asarray(own["base"])
+                figures.append(
                     {
-                        "mine": own["mine"].mean() if len(own) else np.nan,
-                        "base": own["base"].mean() if len(own) else np.nan,
+                        "mine": ours.mean() if len(own) else np.nan,
+                        "base": theirs.mean() if len(own) else np.nan,
                         "played": len(own),
-                        "won": wins(own["mine"], own["base"]),
+                        "won": wins(ours, theirs),
                     }
-                    for own in (both[both["member"] == member] for member in mine["member"].unique())
-                ]
-            )
+                )
+            self._pairs[cell, metric] = pd.DataFrame(figures)
         return self._pairs[cell, metric]
 
     def change(
@@ -362,10 +366,9 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
     for rows in (mine, base):
         if rows.duplicated(["member", "seed"]).any():
             raise ValueError(f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}")
-    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy())
-    own = mine.sort_values("seed", kind="stable")
-    both = pd.DataFrame({"member": own["member"], "mine": own[metric], "base": own["seed"].map(others)})
-    return both[np.isfinite(both[["mine", "base"]]).all(axis=1)]
+    own = pd.DataFrame({"member": mine["member"], "seed": mine["seed"], "mine": mine[metric]})
+    others = pd.DataFrame({"seed": base["seed"], "base": base[metric]})
+    return own.merge(others, on="seed").sort_values("seed", kind="stable").dropna()
 
 
 def _against(pairing: Pairing, groups: Groups) -> list[Change]:

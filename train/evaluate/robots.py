@@ -59,7 +59,7 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
         for cell in table.cells_of(policy):
             condition = table.conditions[policy, cell]
             rows = table.of(policy, cell)
-            if condition.swept or rows["seed"].nunique() < FEWEST_ROBOTS or not _draws_robots(condition):
+            if condition.swept or len(set(rows["seed"])) < FEWEST_ROBOTS or not _draws_robots(condition):
                 continue
             failed, episodes = failures(rows)
             against = {other: table.of(other, cell) for other in others if (other, cell) in table.conditions}

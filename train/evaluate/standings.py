@@ -119,7 +119,7 @@ def standings(
                     score=score(rows, column),
                     failed=failed,
                     episodes=episodes,
-                    training_seeds=rows["member"].nunique() if members else 0,
+                    training_seeds=len(members),
                     base=against_base.get((scope.policy, *scope.name, column)),
                     rival=rival,
                     step_us=step_us.get(scope.policy, float("nan")),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -109,7 +110,8 @@ class EpisodeTable:
 
     @cached_property
     def _parts(self) -> dict[tuple[str, int], pd.DataFrame]:
-        return {(str(key[0]), int(key[1])): own for key, own in self.rows.groupby(["policy", "cell"])}
+        parts: Any = self.rows.groupby(["policy", "cell"])
+        return dict(iter(parts))
 
 
 def means(values: pd.Series) -> float:
@@ -120,7 +122,8 @@ def means(values: pd.Series) -> float:
 
 def per_seed(rows: pd.DataFrame, metric: str, statistic: Callable[[pd.Series], float] = means) -> Array:
     """A statistic of a metric for each training seed and cell, (seeds, cells), in the order of the rows."""
-    found = {key: statistic(own) for key, own in rows.groupby(["member", "cell"])[metric]}
+    parts: Any = rows.groupby(["member", "cell"])[metric]
+    found = {key: statistic(own) for key, own in parts}
     members = rows["member"].unique()
     cells = rows["cell"].unique()
     return np.array([[found.get((member, cell), np.nan) for cell in cells] for member in members])
@@ -144,4 +147,4 @@ def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
 
 def failures(rows: pd.DataFrame) -> tuple[int, int]:
     """Episodes that failed, and all."""
-    return int(rows["failed"].sum()), len(rows)
+    return int(rows["failed"].to_numpy().sum()), len(rows)

@@ -27,9 +27,9 @@ from train.experiments.timing import step_times
 from train.figures import plots
 from train.figures.figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
-from train.report.changes_tables import print_changes, write_maps, write_statistics
+from train.report.change_tables import print_changes, write_maps, write_statistics
 from train.report.leaderboard import print_leaderboard, write_leaderboard
-from train.report.robots_tables import print_robots, write_robots
+from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import describe, locked, require_run, run_folder
 from train.runs.kinds import is_a

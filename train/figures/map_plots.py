@@ -189,7 +189,7 @@ def _wrapped(text: str, width: int = 52) -> str:
     return "\n".join(textwrap.wrap(text, width))
 
 
-def in_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
+def panel_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
     """Head and rows of a panel as a table, the greatest y first."""
     rows: Sequence[tuple[str, Sequence[Square]]] = list(zip(panel.y_ticks, panel.squares, strict=True))[::-1]
     head = [f"{panel.y_label} \\ {panel.x_label}", *panel.x_ticks]

@@ -25,10 +25,10 @@ from train.report.parts import (
     level,
     note,
     nth,
-    number_interval,
     round_numbers,
     shortened,
 )
+from train.report.render import number_interval
 from train.runs.escaping import chart_text
 
 
@@ -166,7 +166,7 @@ def _values(places: Sequence[float], estimates: Sequence[Estimate], cells: Seque
         known = np.isfinite(estimate.value)
         end = estimate.value if estimate.high is None else estimate.high
         x.append(digits(end) if known else 10 ** (left + 1e-3))
-        text.append(f"  {number_interval(estimate, column)}{crosses}" if known else crosses)
+        text.append(f"  {number_interval(estimate.scaled(1.0 / column.scale), column)}{crosses}" if known else crosses)
     return {
         "type": "scatter", "mode": "text", "x": x, "y": list(places), "text": text, "textposition": "middle right",
         "textfont": {"size": 12, "color": INK}, "hoverinfo": "skip", "xaxis": f"x{axis}", "cliponaxis": False,

@@ -73,16 +73,6 @@ def level(cell: Sequence[Evaluation], column: Column) -> Estimate:
     return score(EpisodeTable(cell).rows, column)
 
 
-def number_interval(estimate: Estimate, column: Column) -> str:
-    """A figure in the unit in which it is shown, with its interval; - where there is none."""
-    if not np.isfinite(estimate.value):
-        return "-"
-    text = f"{estimate.value:.{column.decimals}f}"
-    if estimate.low is None or estimate.high is None:
-        return text
-    return f"{text} [{estimate.low:.{column.decimals}f}, {estimate.high:.{column.decimals}f}]"
-
-
 def shortened(name: str) -> str:
     """The end of a name that is too long: of a path it is what differs."""
     return name if len(name) <= LONGEST_NAME else "…" + name[1 - LONGEST_NAME :]

@@ -35,12 +35,6 @@ from train.evaluate.table import EpisodeTable, failures, per_seed
 from train.figures.plots import colours
 from train.report.parts import Lines
 
-SCORES = (
-    "Mean over the episodes that reached the end; of residuals the interquartile mean over training seeds, with its "
-    "95 % interval."
-)
-"""What the tables of scores hold."""
-
 
 @dataclass(frozen=True)
 class Results:
@@ -176,7 +170,7 @@ def facts(results: Results) -> list[tuple[str, str]]:
     """The subject of the comparison, its date and versions: terms and texts."""
     table = results.table
     origin = results.metadata
-    seeds = table.rows["seed"]
+    seeds = table.rows["seed"].tolist()
     per_cell = sorted({len(e.episodes) for e in results.evaluations})
     versions = ", ".join(f"{name} {version}" for name, version in origin["versions"].items() if version)
     quantity = table.environment.quantity or "reference"
@@ -185,7 +179,7 @@ def facts(results: Results) -> list[tuple[str, str]]:
         ("policies", ", ".join(table.policies)),
         (f"{quantity}s", ", ".join(table.references)),
         ("scenarios", ", ".join(table.scenarios)),
-        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({seeds.min(), seeds.max()}))}"),
+        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"),
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]

@@ -1,21 +1,22 @@
 """The report of a comparison: `report.html`, which works without a network, and its tables as Markdown."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
-from train.evaluate.changes import SIGNS_ARE, by_line
+from train.evaluate.changes import SIGNS_ARE
 from train.evaluate.episodes import group_by
 from train.figures.figures import swept_scenarios
 from train.figures.map_plots import panels
+from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
 from train.report.curves import learning, over_time, sweep
-from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenarios_board
+from train.report.leaderboard import PAIRED, board, claims_table, legend, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
-from train.report.report_text import SCORES, Results, capital, facts, headline, in_short, notes
-from train.report.robots_tables import ROBOTS, WORDS, robots_table, scores_table
+from train.report.render import Table
+from train.report.report_text import Results, capital, facts, headline, in_short, notes
+from train.report.score_tables import ROBOTS, SCORES, robots_table, scores_table
 
 _LONG = 40
 """Rows from which on a table is folded away."""
@@ -76,16 +77,16 @@ def _add_leaderboard(page: Page, results: Results) -> None:
     found = results.standings
     if not found:
         return
-    main, single = board(found), scenarios_board(found)
     page.section("Leaderboard", legend(found))
-    page.add("board", main)
-    table = paired_rows(found)
-    if table[1]:
+    page.add("table", board(found))
+    claims = claims_table(found)
+    if claims.rows:
         page.add("heading", "What learning adds")
         page.add("text", PAIRED)
-        _add_table(page, table, words=3)
+        _add_table(page, claims)
+    single = scenarios_board(found)
     if single is not None:
-        page.add("board", single, folded=f"Single scenarios, {main.columns[0][1]}")
+        page.add("table", single, folded=f"Single scenarios, {found[0].reference}")
 
 
 def _add_maps(page: Page, results: Results) -> None:
@@ -123,7 +124,6 @@ def _add_ladder(page: Page, results: Results) -> None:
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
     *of_residuals, (name_of_others, others) = results.grouped_changes.items()
-    more = {"colour": results.lines.colour, "swept": results.table.swept}
     for name, rows in of_residuals:
         if not rows:
             continue
@@ -138,13 +138,13 @@ def _add_changes(page: Page, results: Results) -> None:
             own = [row for row in rows if row.policy == title and row.is_judged]
             page.add("heading", f"{title} against {own[0].base}")
             page.add("chart", forest(own))
-        page.add("changes", {"lines": by_line(rows), **more}, _if_long("Table of changes", rows))
+        _add_table(page, changes_table(rows, results.colours), "Table of changes")
     if others:
         page.section(
             name_of_others,
             "Paired differences of means. Baselines are not trained: there are no training seeds to draw from.",
         )
-        page.add("changes", {"lines": by_line(others), **more}, _if_long("Table of differences", others))
+        _add_table(page, changes_table(others, results.colours), "Table of differences")
 
 
 def _add_robots(page: Page, results: Results) -> None:
@@ -152,24 +152,19 @@ def _add_robots(page: Page, results: Results) -> None:
     if not results.robots:
         return
     page.section("Drawn robots", ROBOTS)
-    _add_table(page, robots_table(results.robots), WORDS, "Table of drawn robots")
+    _add_table(page, robots_table(results.robots), "Table of drawn robots")
 
 
-def _add_table(page: Page, table: tuple[list[str], list[list[str]]], words: int, title: str = "Table") -> None:
-    """A table of a head and rows, whose first columns hold words; folded away under its title where it is long."""
-    head, rows = table
-    page.add("table", {"head": head, "rows": rows, "words": words}, _if_long(title, rows))
-
-
-def _if_long(title: str, rows: Sequence[object]) -> str | None:
-    """The title under which a table is folded away; None for a short one."""
-    return f"{title} ({len(rows)} rows)" if len(rows) > _LONG else None
+def _add_table(page: Page, table: Table, title: str = "Table") -> None:
+    """A table, folded away under its title where it is long."""
+    number = len(table.rows)
+    page.add("table", table, f"{title} ({number} rows)" if number > _LONG else None)
 
 
 def _add_phases(page: Page, results: Results) -> None:
     for title, columns in results.environment.splits:
         page.section(title, SCORES)
-        _add_table(page, scores_table(results.table, columns), words=3 + len(results.table.swept))
+        _add_table(page, scores_table(results.table, columns))
 
 
 def _add_curves(page: Page, results: Results) -> None:
