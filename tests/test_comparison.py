@@ -32,7 +32,7 @@ from train.evaluate.progress import learning_curves
 from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, wins
 from train.evaluate.table import EpisodeTable, score
 from train.experiments.compare import CompareConfig, _each_once
-from train.figures.figures import has_swept_references
+from train.figures.comparison_figures import has_swept_references
 from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page

@@ -22,7 +22,7 @@ from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
 from train.experiments.compare import CompareConfig
-from train.figures.figures import draw_maps
+from train.figures.comparison_figures import draw_maps
 from train.figures.map_plots import Square, blended, panels
 from train.report import Results, write_report
 from train.report.change_tables import write_maps

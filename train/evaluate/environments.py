@@ -113,7 +113,7 @@ class Environment:
         splits: Further tables of the summary, title and columns.
         subject: What the summary table is about.
         note: What its reader has to know beside the legend of the columns.
-        figures: Names of the time series to draw, see `train.figures.figures`.
+        figures: Names of the time series to draw, see `train.figures.comparison_figures`.
         overview: Column of the bar chart.
         swept: Columns drawn against a swept value.
         learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.

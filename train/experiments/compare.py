@@ -25,7 +25,7 @@ from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import standings
 from train.experiments.timing import step_times
 from train.figures import plots
-from train.figures.figures import draw_figures, draw_maps
+from train.figures.comparison_figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.change_tables import print_changes, write_maps, write_statistics
 from train.report.leaderboard import print_leaderboard, write_leaderboard

@@ -12,9 +12,9 @@ import numpy as np
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS, Change, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
-from train.figures.plots import colours, require_matplotlib, save
+from train.figures.colours import INK, policy_colours
+from train.figures.plots import require_matplotlib, save
 
-INK = "#1f2328"
 _AHEAD, _BEHIND, _SCORE, _EMPTY = "#1a7f5a", "#b42318", "#2a6f97", "#f1f3f5"
 _STRONGEST, _STRONGEST_CHANGE = 0.75, 1.0
 """Share of a colour in the strongest square, and the change from which on it has that share."""
@@ -68,7 +68,7 @@ class Panel:
 
 def panels(heat_map: HeatMap) -> list[Panel]:
     """Who is best, every residual against the best policy without learning, and the score of every policy."""
-    column, shades = heat_map.column, colours(heat_map.policies)
+    column, shades = heat_map.column, policy_colours(heat_map.policies)
     letters = dict(zip(heat_map.policies, ascii_uppercase, strict=False))  # a map with more would not be readable
     key = tuple((letters.get(title, "?"), title, shades[title]) for title in heat_map.policies)
     many = len({cell.best_analytic for cell in heat_map.flat} - {None}) > 1

@@ -11,7 +11,8 @@ from baselines.identification.static_points import StaticPoints, link_torque
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import RobotModel
 from train.evaluate.episodes import Evaluation
-from train.figures.plots import MRAD, colours, require_matplotlib, save
+from train.figures.colours import policy_colours
+from train.figures.plots import MRAD, require_matplotlib, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
@@ -65,7 +66,7 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
     plt = require_matplotlib()
     figure, axis = plt.subplots(figsize=(7.6, 4.4))
-    gravity, shades = [make_gravity(model)], _shades(evaluations)
+    gravity, shades = [make_gravity(model)], policy_colours([e.condition.policy.title for e in evaluations])
     for index, evaluation in enumerate(evaluations):
         policy, points = evaluation.condition.policy.title, evaluation.points
         if points is None:
@@ -89,38 +90,12 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     return save(figure, path)
 
 
-def _shades(evaluations: Sequence[Evaluation]) -> dict[str, str]:
-    return colours([evaluation.condition.policy.title for evaluation in evaluations])
-
-
 def static_errors(evaluation: Evaluation) -> Array:
     """Link error by the IMU, averaged over each window at rest of the first episode, (visits,) [rad]."""
     points = evaluation.points
     assert points is not None
     references = evaluation.rest_references
     return references - points.q
-
-
-def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Reference and link error over time, one line per policy."""
-    plt = require_matplotlib()
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(8.0, 5.0), sharex=True, height_ratios=(1, 2))
-    first = evaluations[0]
-    top.plot(first.trace["time_s"], first.trace["reference_angle"], color="#333333", lw=1.2)
-    top.set_ylabel("q_ref [rad]")
-    top.set_title(f"{first.condition.reference_name}, scenario {first.condition.scenario}")
-    shades = _shades(evaluations)
-    for evaluation in evaluations:
-        policy = evaluation.condition.policy.title
-        bottom.plot(
-            evaluation.trace["time_s"], MRAD * evaluation.trace["link_error"], lw=1.1,
-            color=shades[policy], label=policy,
-        )  # fmt: skip
-    bottom.axhline(0.0, color="#888888", lw=0.8)
-    bottom.set_ylabel("link error q_ref − q [mrad]")
-    bottom.set_xlabel("time [s]")
-    bottom.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2))
-    return save(figure, path)
 
 
 def _fitted(result: Identification, torque: Array, direction: int) -> Array:

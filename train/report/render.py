@@ -21,7 +21,8 @@ from rich.text import Text
 from elastic_env.core.errors import missing_extra
 from train.evaluate.environments import Column
 from train.evaluate.statistics import Estimate
-from train.report.parts import FONT, NIGHT, VERDICTS
+from train.figures.colours import NIGHT, VERDICTS
+from train.report.specs import FONT
 from train.runs.escaping import csv_row, markdown_text, script_json, template_value
 
 if TYPE_CHECKING:

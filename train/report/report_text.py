@@ -32,8 +32,7 @@ from train.evaluate.robots import RobotScores
 from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, failures, per_seed
-from train.figures.plots import colours
-from train.report.parts import Lines
+from train.figures.colours import policy_colours
 
 
 @dataclass(frozen=True)
@@ -71,14 +70,9 @@ class Results:
         return self.table.environment
 
     @cached_property
-    def lines(self) -> Lines:
-        """Policies with their colours."""
-        return Lines(self.evaluations)
-
-    @cached_property
     def colours(self) -> dict[str, str]:
         """Colours of the policies, the same in every chart."""
-        return colours(self.table.policies)
+        return policy_colours(self.table.policies)
 
     @cached_property
     def learning(self) -> dict[str, Curves]:

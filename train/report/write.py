@@ -1,25 +1,34 @@
 """The report of a comparison: `report.html`, which works without a network, and its tables as Markdown."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.changes import SIGNS_ARE
-from train.evaluate.episodes import group_by
-from train.figures.figures import swept_scenarios
+from train.evaluate.environments import Column
+from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.statistics import Estimate
+from train.evaluate.table import EpisodeTable, score
+from train.figures.chart import Cells, learning_chart, sweep_chart, time_chart
+from train.figures.comparison_figures import by_option, by_reference, cells_together, swept_scenarios
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
-from train.report.curves import learning, over_time, sweep
 from train.report.leaderboard import PAIRED, board, claims_table, legend, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
 from train.report.render import Table
 from train.report.report_text import Results, capital, facts, headline, in_short, notes
 from train.report.score_tables import ROBOTS, SCORES, robots_table, scores_table
+from train.report.specs import page_chart
 
 _LONG = 40
 """Rows from which on a table is folded away."""
+_POINTS = 600
+_LEAST_POINTS = 250
+_ALL_POINTS = 6000
+"""Points of a curve, at most and at least, and of all cells together, so that a large comparison stays small."""
 
 
 def require_plotly() -> str:
@@ -66,7 +75,8 @@ def _page(results: Results) -> Page:
             "Score over that of the base (dotted) on episodes that training never sees, mean over the trained "
             "scenarios: median over training seeds, band from the best to the worst.",
         )
-        page.add("chart", learning(results.learning, known.judged, results.lines.colour))
+        chart = learning_chart(results.learning, known.judged, results.colours)
+        page.add("chart", page_chart(chart))
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
@@ -114,9 +124,9 @@ def _add_ladder(page: Page, results: Results) -> None:
         "Ladder of policies",
         f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}",
     )
-    references = results.lines.references
+    references = results.table.references
     for number, reference in enumerate(references):
-        chart = ladder(results.lines, reference)
+        chart = ladder(results.table, reference, results.colours)
         title = results.environment.title(reference)
         page.add("chart", chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
 
@@ -168,41 +178,35 @@ def _add_phases(page: Page, results: Results) -> None:
 
 
 def _add_curves(page: Page, results: Results) -> None:
+    """Signals of the first episodes over time, a chart for each motion and scenario."""
+    table = results.table
     seeds = " Of residuals: median over training seeds, band from the least to the most."
-    band = seeds if results.table.members else ""
-    shade = " Single support is shaded." if results.environment.splits else ""
+    band = seeds if table.members else ""
+    shade = " Single support is shaded." if table.environment.splits else ""
     text = f"The first episode of every cell; a line ends where the episode does.{band}{shade}"
     page.section("Curves over time", text)
-    first = True
-    for reference in results.lines.references:
-        for scenario in results.lines.scenarios:
-            chart = over_time(results.lines, reference, scenario)
-            if chart is not None:
-                title = f"{results.environment.title(reference)}, {scenario}"
-                page.add("chart", chart, folded=capital(title), is_open=first)
-                first = False
+    most = min(_POINTS, max(_LEAST_POINTS, _ALL_POINTS // (len(table.references) * len(table.scenarios))))
+    traced = [e for e in results.evaluations if e.trace]
+    cells = group_by(traced, lambda e: (e.condition.reference_name, e.condition.scenario))
+    for number, ((reference, scenario), own) in enumerate(cells.items()):
+        policies = group_by(own, lambda e: e.condition.policy.title)
+        chart = time_chart(policies, table.environment.curves, results.colours, most)
+        title = f"{table.environment.title(reference)}, {scenario}"
+        page.add("chart", page_chart(chart), folded=capital(title), is_open=number == 0)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:
     """Scores over the swept option, or over what the references differ in."""
-    lines = results.lines
-    charts = []
+    known = results.environment
+    charts: list[tuple[str, Cells, str]] = []
     if results.swept is not None:
-        for reference in lines.references:
-            for scenario in lines.scenarios:
-                cells = {t: lines.cell(t, reference_name=reference, scenario=scenario) for t in lines.titles}
-                points = {
-                    t: group_by(own, lambda e: next(iter(e.condition.swept.values()), None)) for t, own in cells.items()
-                }
-                charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
+        for own in cells_together(results.evaluations):
+            title = f"{known.title(own[0].condition.reference_name)}, {own[0].condition.scenario}"
+            charts.append((title, by_option(own), results.swept))
     else:
         for scenario in swept_scenarios(results.evaluations):
-            cells = {t: lines.cell(t, scenario=scenario) for t in lines.titles}
-            points = {
-                t: group_by((e for e in own if e.condition.number is not None), lambda e: e.condition.number)
-                for t, own in cells.items()
-            }
-            charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
+            own = [e for e in results.evaluations if e.condition.scenario == scenario]
+            charts.append((f"scenario {scenario}", by_reference(own), f"{known.quantity} [s]"))
     if not charts:
         return
     page.section(
@@ -210,6 +214,10 @@ def _add_sweeps(page: Page, results: Results) -> None:
         "Means over the episodes that reached the end. A cross on top: all episodes of a policy failed there; an "
         "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.table.members else ""),
     )
-    for number, (title, points, label) in enumerate(charts):
-        chart = sweep(lines, {t: own for t, own in points.items() if own}, label)
-        page.add("chart", chart, folded=capital(title), is_open=number == 0)
+    for number, (title, cells, label) in enumerate(charts):
+        chart = sweep_chart(cells, known.judged, label, results.colours, _cell_score)
+        page.add("chart", page_chart(chart), folded=capital(title), is_open=number == 0)
+
+
+def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:
+    return score(EpisodeTable(cell).rows, column)
