@@ -5,14 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import bootstrap
 
-from docs.pages.cells import Rows, minus
+from docs.pages.cells import Rows, minus, page_table
 from elastic_env.core.signals import Array
 from train.evaluate.episodes import group_by
-from train.runs.escaping import markdown_table
 
 _FIRST = "panda"
 """Robot of the gallery that README begins with."""
-_POLICIES, _TOOL = ("input", "link_encoder"), "end_effector_error_rms_m"
+_POLICIES = ("input", "link_encoder")
+_TOOL = "end_effector_error_rms_m"
 """Policies of an arm that are compared, and by what."""
 
 
@@ -25,7 +25,7 @@ def one_arm(gallery: Rows) -> str:
     ]
     head = [f"{row['title']}, sag at rest [mm]", "without compensation", "`input`"]
     lines = [["K as assumed", *shown[0]], ["K 30 % softer than assumed", *shown[1]]]
-    return markdown_table(head, ["---", "---:", "---:"], lines) + "\n"
+    return page_table(head, lines)
 
 
 def link_encoders(episodes: Rows) -> str:
@@ -35,12 +35,17 @@ def link_encoders(episodes: Rows) -> str:
         errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES}
         base, other = (errors[policy] for policy in _POLICIES)
         ends = bootstrap(
-            (base, other), _change, paired=True, vectorized=True, method="BCa", rng=np.random.default_rng(0)
+            (base, other),
+            _change,
+            paired=True,
+            vectorized=True,
+            method="BCa",
+            rng=np.random.default_rng(0),
         ).confidence_interval
         change = f"{_percent(_change(base, other))} [{_percent(ends.low)}, {_percent(ends.high)}]"
         rows.append([f"`{scenario}`", f"{1e3 * base.mean():.2f}", f"{1e3 * other.mean():.2f}", change])
     head = ["scenario", *(f"`{policy}` [mm]" for policy in _POLICIES), "change"]
-    return markdown_table(head, ["---", "---:", "---:", "---:"], rows) + "\n"
+    return page_table(head, rows)
 
 
 def _change(base: Array, other: Array, axis: int = -1) -> Array:
@@ -60,9 +65,12 @@ def arm_identification(rows: Rows) -> str:
     arm = [own[0] for own in kinds.values()]
     errors = [
         ["**error before [mm]**", *(f"{1e3 * float(row['before_median_m']):.1f}" for row in arm)],
-        ["**error after [mm], median, largest**", *(_two(row, "after_median_m", "after_most_m") for row in arm)],
+        [
+            "**error after [mm], median, largest**",
+            *(_two(row, "after_median_m", "after_most_m") for row in arm),
+        ],
     ]
-    return markdown_table(head, ["---", *["---:"] * len(kinds)], [*counted, *errors]) + "\n"
+    return page_table(head, [*counted, *errors])
 
 
 def _counted(row: Mapping[str, str]) -> str:

@@ -37,13 +37,17 @@ class CellsFailedError(ElasticError):
 
 
 def run_conditions(
-    conditions: Sequence[Condition], console: Console, place: Place = HERE, store: Store | None = None,
+    conditions: Sequence[Condition],
+    console: Console,
+    place: Place = HERE,
+    store: Store | None = None,
     fresh: bool = False,
-) -> list[Evaluation]:  # fmt: skip
+) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    The results do not depend on where they are played. On hardware the conditions come one after the other, in this
-    process, at whose terminal somebody can agree to them; nothing is kept of them.
+    The results do not depend on where they are played. On hardware the conditions come one after
+    the other, in this process, at whose terminal somebody can agree to them; nothing is kept of
+    them.
 
     Args:
         conditions: What to play.
@@ -96,15 +100,21 @@ class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
     def __init__(self, conditions: Sequence[Condition], console: Console, place: Place, store: Store | None) -> None:
-        self._conditions, self._console, self._place, self._store = conditions, console, place, store
+        self._conditions = conditions
+        self._console = console
+        self._place = place
+        self._store = store
         steps = num_steps(conditions)
         cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
         batches = [(batch, sum(steps[number] for number in batch)) for batch in in_batches(conditions, cores)]
         longest_first = sorted(batches, key=lambda batch: -batch[1])
-        self._batches, self._steps = [batch for batch, _ in longest_first], [steps for _, steps in longest_first]
+        self._batches = [batch for batch, _ in longest_first]
+        self._steps = [steps for _, steps in longest_first]
         self._keys = [] if store is None else [cell_key(condition) for condition in conditions]
         self._played = [0] * len(self._batches)
-        self._running, self._done, self._failed = set[int](), 0, 0
+        self._running = set[int]()
+        self._done = 0
+        self._failed = 0
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
         self._show: Show = lambda *_: None
 
@@ -166,9 +176,8 @@ class _Playing:
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     """Conditions, by their numbers, that are played in one vector environment: many worlds cost less each.
 
-    Args:
-        conditions: What to play.
-        cores: Batches that are played at a time. There are twice as many, if there can be: not all last as long.
+    Args: conditions: What to play. cores: Batches that are played at a time. There are twice as
+        many, if there can be: not all last as long.
     """
     worlds = sum(condition.episodes for condition in conditions)
     most = min(worlds // (2 * cores), MOST_WORLDS)
@@ -178,11 +187,17 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
         if not can_share_worlds(condition):
             batches.append([number])
             continue
-        policy = condition.policy, condition.member, condition.policy_options, condition.reference_name
+        policy = (
+            condition.policy,
+            condition.member,
+            condition.policy_options,
+            condition.reference_name,
+        )
         key = repr((policy, shared_settings(condition)))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
-            batch, size = [], 0
+            batch = []
+            size = 0
             batches.append(batch)
         batch.append(number)
         open_batch[key] = batch, size + condition.episodes
@@ -194,7 +209,10 @@ def _said(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     error = outcome.error
     assert error is not None
     found = explained(error)
-    said, code = found or (f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}", DEFECT)
+    said, code = found or (
+        f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}",
+        DEFECT,
+    )
     return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
 
 
@@ -207,7 +225,9 @@ def _name(condition: Condition) -> str:
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
-    (total,), done, say = num_steps([condition]), 0, plain_progress(console)
+    (total,) = num_steps([condition])
+    done = 0
+    say = plain_progress(console)
     console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True)
 
     def advance(steps: int) -> None:

@@ -1,6 +1,7 @@
 """Paired changes of a comparison: every residual against its base and against the best policy without learning.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first policy.
+Every baseline is compared with the base of the residuals, or without residuals with the first
+policy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,19 +17,28 @@ from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.families import Origin
-from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, wins
+from train.evaluate.statistics import (
+    Estimate,
+    change,
+    improvement,
+    interquartile_mean,
+    over_seeds,
+    wins,
+)
 from train.evaluate.table import EpisodeTable, failures
 
-CEILING, SAME_ROBOT = "ceiling on the training condition", "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot is that of the
-training, so that evaluation differs by noise alone."""
-HELD_OUT, PARTLY = "held out", "partly held out"
+CEILING = "ceiling on the training condition"
+SAME_ROBOT = "trained robot"
+"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot
+is that of the training, so that evaluation differs by noise alone."""
+HELD_OUT = "held out"
+PARTLY = "partly held out"
 """Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
 """What a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
-misses the truth, over five every eleventh."""
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds
+every other one misses the truth, over five every eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any effect."""
 
@@ -49,26 +59,22 @@ Groups = Mapping[str, Sequence[str]]
 class Change:
     """A policy against its base in one metric, in one scenario or pooled over a group of them.
 
-    Attributes:
-        policy, base: Titles.
-        is_family: Whether the policy is a residual, so that it has training seeds.
-        reference: Label of the motion.
-        scope: Scenario, or name of the group.
-        is_group: Whether it is a group.
-        swept: Options that a sweep varies, and their values.
-        marks: What the reader has to know of the row: a ceiling, something held out.
-        column: The metric.
-        is_judged: Whether policies are judged by it; else it stands in tables alone.
-        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
-        relative: Interquartile mean of it over training seeds.
-        improvement: Probability that an episode is better than the base's.
-        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile mean over training
+    Attributes: policy, base: Titles. is_family: Whether the policy is a residual, so that it has
+        training seeds. reference: Label of the motion. scope: Scenario, or name of the group.
+        is_group: Whether it is a group. swept: Options that a sweep varies, and their values.
+        marks: What the reader has to know of the row: a ceiling, something held out. column: The
+        metric. is_judged: Whether policies are judged by it; else it stands in tables alone.
+        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
+        baseline one value. relative: Interquartile mean of it over training seeds. improvement:
+        Probability that an episode is better than the base's. mine, theirs: Metric of the policy
+        and of its base over the pairs [SI]; the interquartile mean over training
             seeds.
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
-        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
+        is_rival: Whether `base` is not the base of the residual but the best policy without
+            learning.
     """
 
     policy: str
@@ -107,7 +113,8 @@ class Change:
     @property
     def verdict(self) -> Verdict:
         """lower, higher, none (the interval includes zero), or unclear (too few training seeds to say)."""
-        low, high = self.relative.low, self.relative.high
+        low = self.relative.low
+        high = self.relative.high
         if low is None or high is None or self.num_compared < FEWEST_SEEDS:
             return "unclear"
         return "lower" if high < 0.0 else "higher" if low > 0.0 else "none"
@@ -289,7 +296,12 @@ class Pairing:
         return self._pairs[cell, metric]
 
     def change(
-        self, column: Column, cells: Sequence[int], scope: str, is_group: bool, marks: tuple[str, ...] = ()
+        self,
+        column: Column,
+        cells: Sequence[int],
+        scope: str,
+        is_group: bool,
+        marks: tuple[str, ...] = (),
     ) -> Change:
         """The change of one metric, over one cell or pooled over several.
 
@@ -410,7 +422,11 @@ def _mean(values: Array) -> float:
 
 
 def _marks(
-    trained: Origin | None, known: Environment, reference: str, scenarios: Sequence[str], swept: Mapping[str, float]
+    trained: Origin | None,
+    known: Environment,
+    reference: str,
+    scenarios: Sequence[str],
+    swept: Mapping[str, float],
 ) -> tuple[str, ...]:
     """What training has seen of a row's condition."""
     if trained is None:
@@ -439,7 +455,8 @@ def _marks(
 
 def _seen_as(condition: Condition, trained: Origin | None) -> str:
     """The scenario of a condition; one whose fields are varied by the name under which training has seen the same."""
-    played, ranges = condition.scenario_played, {} if trained is None else trained.ranges
+    played = condition.scenario_played
+    ranges = {} if trained is None else trained.ranges
     if isinstance(played, str) and not ranges:
         return played
     seen = trained.scenarios if trained is not None and trained.scenarios is not None else ()
@@ -449,7 +466,10 @@ def _seen_as(condition: Condition, trained: Origin | None) -> str:
     )
     if condition.swept:
         return next(same, f"varied {condition.scenario}")
-    return next(same, f"{condition.scenario} of other ranges" if condition.scenario in seen else condition.scenario)
+    return next(
+        same,
+        f"{condition.scenario} of other ranges" if condition.scenario in seen else condition.scenario,
+    )
 
 
 def _motion(known: Environment, reference: Any) -> str:

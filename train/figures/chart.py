@@ -138,7 +138,12 @@ def time_chart(
 
 
 def _median_curve(
-    title: str, colour: str, own: Sequence[Evaluation], signal: TracedSignal, time_s: Array, stride: int
+    title: str,
+    colour: str,
+    own: Sequence[Evaluation],
+    signal: TracedSignal,
+    time_s: Array,
+    stride: int,
 ) -> Curve:
     length = max(len(e.trace["time_s"]) for e in own)
     values = np.full((len(own), length), np.nan)
@@ -211,7 +216,13 @@ def sweep_chart(
             x = np.array([values[0], values[-1]] if is_level else [value for value in values if value in own])
             found = [statistic(own[None if is_level else value], column).scaled(column.scale) for value in x.tolist()]
             ends = np.array([estimate.ends for estimate in found]).T
-            curve = Curve(title, colours[title], x, np.array([estimate.value for estimate in found]), width=1.6)
+            curve = Curve(
+                title,
+                colours[title],
+                x,
+                np.array([estimate.value for estimate in found]),
+                width=1.6,
+            )
             if is_level:
                 curves.append(replace(curve, dash="dot"))
                 continue
@@ -237,7 +248,10 @@ def sweep_chart(
 
 
 def _failing(
-    title: str, colour: str, own: Mapping[float | None, Sequence[Evaluation]], values: Sequence[float]
+    title: str,
+    colour: str,
+    own: Mapping[float | None, Sequence[Evaluation]],
+    values: Sequence[float],
 ) -> Failing:
     """Values at which a policy fails; a level fails at all of them."""
     shares = {}

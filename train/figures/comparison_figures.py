@@ -22,7 +22,12 @@ _MIN_SWEPT_REFERENCES = 3
 """From so many references with a number of their own on, the scores are drawn against it."""
 _PAPER_BOUND_MRAD = 10.0
 """The pelvis error stays below it with compensation in the paper, in its two gaits."""
-_PAPER_FIGURES = {("pelvis", "24 s"): 7, ("pelvis", "3 s"): 8, ("zmp", "24 s"): 9, ("zmp", "3 s"): 10}
+_PAPER_FIGURES = {
+    ("pelvis", "24 s"): 7,
+    ("pelvis", "3 s"): 8,
+    ("zmp", "24 s"): 9,
+    ("zmp", "3 s"): 10,
+}
 _PAPER_SCENARIOS = ("ideal", "nominal")
 _PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad", 1e3) for name in ("roll", "pitch"))
 _ZMP = (
@@ -36,7 +41,10 @@ _LINK = (
 
 
 def draw_figures(
-    evaluations: Sequence[Evaluation], folder: Path, policies: Sequence[str] = (), swept: str | None = None
+    evaluations: Sequence[Evaluation],
+    folder: Path,
+    policies: Sequence[str] = (),
+    swept: str | None = None,
 ) -> list[Path]:
     """Draw the figures of a comparison.
 
@@ -159,7 +167,10 @@ def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
         ends = panel.curves[0].x[[0, -1]]
         bounds = [
             Curve(name, "#777777", ends, np.full(2, bound), dash="dot", width=0.9)
-            for name, bound in (("paper, compensated: ±10 mrad", _PAPER_BOUND_MRAD), ("", -_PAPER_BOUND_MRAD))
+            for name, bound in (
+                ("paper, compensated: ±10 mrad", _PAPER_BOUND_MRAD),
+                ("", -_PAPER_BOUND_MRAD),
+            )
         ]
         low, high = panel.limits or (0.0, 0.0)
         limits = (min(low, -1.2 * _PAPER_BOUND_MRAD), max(high, 1.2 * _PAPER_BOUND_MRAD))

@@ -14,7 +14,8 @@ from train.evaluate.episodes import Evaluation
 from train.figures.chart import Chart, Curve
 from train.figures.colours import FAILED, policy_colours
 
-MRAD, MM = 1e3, 1e3
+MRAD = 1e3
+MM = 1e3
 """Factors from rad and m to what figures show."""
 
 
@@ -126,7 +127,14 @@ def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> 
     if curve.fails:
         last = curve.y[np.isfinite(curve.y)][-1:]
         y = last if limits is None else np.clip(last, *limits)
-        style = {"marker": "X", "s": 70, "edgecolors": "white", "lw": 0.8, "zorder": 6, "clip_on": False}
+        style = {
+            "marker": "X",
+            "s": 70,
+            "edgecolors": "white",
+            "lw": 0.8,
+            "zorder": 6,
+            "clip_on": False,
+        }
         axis.scatter(curve.x[-1:], y, color=curve.colour, **style)
 
 
@@ -155,7 +163,8 @@ def _show_numbers(axis: Any) -> None:
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
     """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel with all references.
 
-    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that failed.
+    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
+    failed.
     """
     plt = require_matplotlib()
     known = evaluations[0].condition.environment
@@ -163,7 +172,8 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
     panels: dict[str, dict[str, list[Evaluation]]] = {}
     for evaluation in evaluations:
-        reference, scenario = evaluation.condition.reference_name, evaluation.condition.scenario
+        reference = evaluation.condition.reference_name
+        scenario = evaluation.condition.scenario
         outer, inner = (
             (f"scenario {scenario}", reference) if len(scenarios) == 1 else (known.title(reference), scenario)
         )
@@ -172,9 +182,14 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
     figure, axes = plt.subplots(
-        rows, columns, figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
-        sharey=True, sharex=stacked, squeeze=False, layout="constrained",
-    )  # fmt: skip
+        rows,
+        columns,
+        figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
+        sharey=True,
+        sharex=stacked,
+        squeeze=False,
+        layout="constrained",
+    )
     for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
         _draw_bars(axis, groups, column, policies)
         axis.set_title(title)
@@ -194,7 +209,8 @@ _ROOMY = 7
 
 def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]) -> None:
     """A bar per policy in every group."""
-    width, shades = 0.84 / len(policies), policy_colours(policies)
+    width = 0.84 / len(policies)
+    shades = policy_colours(policies)
     for place, evaluation in ((place, e) for place, group in enumerate(groups.values()) for e in group):
         policy = evaluation.condition.policy.title
         index = policies.index(policy)

@@ -30,7 +30,13 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
         (-1, "v", "none", "approached from above"),
     ):
         chosen = points.direction == direction
-        style = {"marker": marker, "s": 34, "facecolors": face, "edgecolors": "#2a6f97", "linewidths": 1.2}
+        style = {
+            "marker": marker,
+            "s": 34,
+            "facecolors": face,
+            "edgecolors": "#2a6f97",
+            "linewidths": 1.2,
+        }
         top.scatter(torque[chosen], MRAD * deflection[chosen], label=label, zorder=3, **style)
         fitted = _fitted(result, line, direction)
         top.plot(line, MRAD * fitted, color="#2a6f97", lw=0.9, ls="-" if direction > 0 else "--")
@@ -49,11 +55,14 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
     )
     top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}")
     top.text(
-        0.03, 0.95,
+        0.03,
+        0.95,
         f"friction {result.friction_nm:.2f} N·m\ndead band {MRAD * result.dead_band_rad:.2f} mrad\n"
         f"offset {MRAD * result.offset_rad:+.2f} mrad\nPearson r {result.pearson_r:.4f}",
-        transform=top.transAxes, va="top", fontsize=9,
-    )  # fmt: skip
+        transform=top.transAxes,
+        va="top",
+        fontsize=9,
+    )
     top.set_ylabel("deflection θ − q [mrad]")
     top.legend(loc="lower right")
     bottom.axhline(0.0, color="#888888", lw=0.8)
@@ -66,20 +75,30 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
     plt = require_matplotlib()
     figure, axis = plt.subplots(figsize=(7.6, 4.4))
-    gravity, shades = [make_gravity(model)], policy_colours([e.condition.policy.title for e in evaluations])
+    gravity = [make_gravity(model)]
+    shades = policy_colours([e.condition.policy.title for e in evaluations])
     for index, evaluation in enumerate(evaluations):
-        policy, points = evaluation.condition.policy.title, evaluation.points
+        policy = evaluation.condition.policy.title
+        points = evaluation.points
         if points is None:
             continue
         error = MRAD * static_errors(evaluation)
-        marker, face = "xosDv^"[index % 6], None if index == 0 else "none"
+        marker = "xosDv^"[index % 6]
+        face = None if index == 0 else "none"
         shade = shades[policy]
         style = {"facecolors": face, "edgecolors": shade} if face else {"color": shade}
-        low, high = error.min(), error.max()
+        low = error.min()
+        high = error.max()
         axis.scatter(
-            link_torque(points, gravity, points.q), error, marker=marker, s=34, linewidths=1.3, zorder=3,
-            label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}", **style,
-        )  # fmt: skip
+            link_torque(points, gravity, points.q),
+            error,
+            marker=marker,
+            s=34,
+            linewidths=1.3,
+            zorder=3,
+            label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}",
+            **style,
+        )
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
         for bound in _PAPER_RANGES_MRAD.get(policy, ()):
             axis.axhline(bound, color=shade, lw=0.9, ls=":")

@@ -56,7 +56,12 @@ def cells_table(rows: Sequence[Change]) -> Table:
         scope = first.scope + _signs(first)
         own = [first.reference, scope] if len(policies) == 1 else [first.policy, first.reference, scope]
         figures = {row.column: signed_interval(row.relative, row.verdict) for row in line}
-        cells = [*own, *_swept(first, swept), *(figures[column] for column in columns), failed_and_base(first)]
+        cells = [
+            *own,
+            *_swept(first, swept),
+            *(figures[column] for column in columns),
+            failed_and_base(first),
+        ]
         lines.append(Row(tuple(cells), kind="group" if first.is_group else ""))
     title = f"change against {_opponent(rows)} on the same episodes, {_seeds(rows)}"
     return Table(
@@ -93,7 +98,10 @@ def changes_table(rows: Sequence[Change], colours: Mapping[str, str]) -> Table:
             lines.append(Row((heading,), kind="heading", dot=colours[row.policy]))
         failed = Part(failed_and_base(row), "failure" if row.falls_more else "")
         cells = [row.reference, _scope(row), *_swept(row, swept), row.column.title, _means(row)]
-        cells += [(Part(percent_interval(row.relative), row.verdict),), percent_interval(row.improvement, signed=False)]
+        cells += [
+            (Part(percent_interval(row.relative), row.verdict),),
+            percent_interval(row.improvement, signed=False),
+        ]
         cells += [(failed,), *([row.sentence] if is_family else [])]
         lines.append(Row(tuple(cells), kind="group" if row.is_group else ""))
     return Table(tuple(heads), tuple(lines), keys=3 + len(swept), kind="changes")
@@ -145,14 +153,45 @@ def failed_and_base(row: Change) -> str:
 
 _HEAD = ("policy", "base", "base_is", "kind", "reference", "scope", "pooled", "marks")
 _FIGURES = (
-    "metric", "base_mean", "mean", "change", "change_low", "change_high", "improvement", "improvement_low",
-    "improvement_high", "training_seeds", "pairs", "failed", "episodes", "base_failed", "base_episodes",
-    "change_per_training_seed", "sentence",
-)  # fmt: skip
+    "metric",
+    "base_mean",
+    "mean",
+    "change",
+    "change_low",
+    "change_high",
+    "improvement",
+    "improvement_low",
+    "improvement_high",
+    "training_seeds",
+    "pairs",
+    "failed",
+    "episodes",
+    "base_failed",
+    "base_episodes",
+    "change_per_training_seed",
+    "sentence",
+)
 _MAP_HEAD = (
-    "map", "x_is", "x", "y_is", "y", "metric", "policy", "mean", "mean_low", "mean_high", "failed", "episodes",
-    "is_best", "is_best_without_learning", "best_without_learning", "change", "change_low", "change_high", "verdict",
-)  # fmt: skip
+    "map",
+    "x_is",
+    "x",
+    "y_is",
+    "y",
+    "metric",
+    "policy",
+    "mean",
+    "mean_low",
+    "mean_high",
+    "failed",
+    "episodes",
+    "is_best",
+    "is_best_without_learning",
+    "best_without_learning",
+    "change",
+    "change_low",
+    "change_high",
+    "verdict",
+)
 
 
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:
@@ -164,10 +203,26 @@ def write_statistics(rows: Sequence[Change], path: Path) -> Path:
 def _record(row: Change, swept: Sequence[str]) -> list[object]:
     role = BEST_ANALYTIC if row.is_rival else "base of the residual" if row.is_family else "policy to compare with"
     kind = "residual" if row.is_family else "baseline"
-    found = [row.policy, row.base, role, kind, row.reference, row.scope, row.is_group, "; ".join(row.marks)]
+    found = [
+        row.policy,
+        row.base,
+        role,
+        kind,
+        row.reference,
+        row.scope,
+        row.is_group,
+        "; ".join(row.marks),
+    ]
     found += [row.swept.get(name, "") for name in swept]
     found += [row.column.metric, row.theirs, row.mine, *row.relative.cells, *row.improvement.cells]
-    found += [row.num_seeds, row.num_pairs, row.falls, row.episodes, row.base_falls, row.base_episodes]
+    found += [
+        row.num_seeds,
+        row.num_pairs,
+        row.falls,
+        row.episodes,
+        row.base_falls,
+        row.base_episodes,
+    ]
     return [*found, " ".join(f"{value:.6g}" for value in row.per_seed), row.sentence]
 
 
@@ -184,4 +239,11 @@ def _map_records(found: HeatMap) -> Iterator[list[object]]:
                 against = ("",) * 4 if change is None else (*change.relative.cells, change.verdict)
                 own = [found.title, found.x.title, x, found.y.title, y, found.column.metric, title]
                 marks = [title == cell.best, title == cell.best_analytic]
-                yield [*own, *estimate.cells, *cell.failed[title], *marks, cell.best_analytic, *against]
+                yield [
+                    *own,
+                    *estimate.cells,
+                    *cell.failed[title],
+                    *marks,
+                    cell.best_analytic,
+                    *against,
+                ]

@@ -148,7 +148,12 @@ def _texts(x: Sequence[float], y: Sequence[float], texts: Sequence[str], axis: s
 
 def _heading(text: str, place: float) -> Spec:
     where = {"x": 0.0, "y": place, "xref": "paper", "yref": "y", "xanchor": "right", "xshift": -8}
-    return {**where, "text": f"<b>{chart_text(text)}</b>", "showarrow": False, "font": {"size": 13, "color": INK}}
+    return {
+        **where,
+        "text": f"<b>{chart_text(text)}</b>",
+        "showarrow": False,
+        "font": {"size": 13, "color": INK},
+    }
 
 
 def _rule(place: float) -> Spec:
@@ -202,7 +207,10 @@ def forest(rows: Sequence[Change]) -> PageChart:
         for scope, line in zip(scopes, lines, strict=True)
     ]
     layout["yaxis"] = base_axis(
-        range=[len(lines) - 0.4, -0.6], tickvals=list(range(len(lines))), ticktext=names, showgrid=False
+        range=[len(lines) - 0.4, -0.6],
+        tickvals=list(range(len(lines))),
+        ticktext=names,
+        showgrid=False,
     )
     return PageChart({"data": data, "layout": layout}, 80 + 27 * len(lines))
 
@@ -219,7 +227,12 @@ def _changes(own: Sequence[tuple[int, Change]], colour: str, axis: str) -> Spec:
         "x": [digits(change.value) for change in relative],
         "y": [place for place, _ in own],
         "error_x": error_bars(relative, colour),
-        "marker": {"size": 9, "color": colour, "symbol": symbols, "line": {"width": 1.6, "color": colour}},
+        "marker": {
+            "size": 9,
+            "color": colour,
+            "symbol": symbols,
+            "line": {"width": 1.6, "color": colour},
+        },
         "hoverinfo": "text",
         "hovertext": [chart_text(f"{row.scope}: {row.sentence}") for _, row in own],
     }

@@ -21,11 +21,32 @@ from train.report.render import Head, Part, Row, Table, print_table, render
 from train.runs.escaping import write_csv
 
 _BASE = ("base", "change", "change_low", "change_high", "verdict")
-_RIVAL = ("best_without_learning", "change_to_best", "change_to_best_low", "change_to_best_high", "verdict_to_best")
+_RIVAL = (
+    "best_without_learning",
+    "change_to_best",
+    "change_to_best_low",
+    "change_to_best_high",
+    "verdict_to_best",
+)
 _HEAD = (
-    "track", "policy", "reference", "scope", "pooled", "column", "title", "metric", "mean", "low", "high", "failed",
-    "episodes", "training_seeds", *_BASE, *_RIVAL, "step_us",
-)  # fmt: skip
+    "track",
+    "policy",
+    "reference",
+    "scope",
+    "pooled",
+    "column",
+    "title",
+    "metric",
+    "mean",
+    "low",
+    "high",
+    "failed",
+    "episodes",
+    "training_seeds",
+    *_BASE,
+    *_RIVAL,
+    "step_us",
+)
 
 
 def board(found: Sequence[Standing]) -> Table:
@@ -196,7 +217,8 @@ def print_leaderboard(found: Sequence[Standing], console: Console) -> None:
 
 def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they agree."""
-    table, text = folder / "leaderboard.csv", folder / "leaderboard.md"
+    table = folder / "leaderboard.csv"
+    text = folder / "leaderboard.md"
     write_csv(_HEAD, map(_record, found), table)
     write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")
     return [table, text]
@@ -204,9 +226,22 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
 
 def _record(s: Standing) -> list[Any]:
     return [
-        str(s.track), s.policy, s.reference, s.scope, s.is_group, s.is_column, s.title, s.metric, *_cells(s.score),
-        s.failed, s.episodes, s.training_seeds, *_paired_cells(s.base), *_paired_cells(s.rival), f"{s.step_us:.3g}",
-    ]  # fmt: skip
+        str(s.track),
+        s.policy,
+        s.reference,
+        s.scope,
+        s.is_group,
+        s.is_column,
+        s.title,
+        s.metric,
+        *_cells(s.score),
+        s.failed,
+        s.episodes,
+        s.training_seeds,
+        *_paired_cells(s.base),
+        *_paired_cells(s.rival),
+        f"{s.step_us:.3g}",
+    ]
 
 
 def _cells(estimate: Estimate) -> list[str]:
@@ -235,13 +270,22 @@ def read_leaderboard(path: Path) -> list[Standing]:
 
 def _standing(row: Mapping[str, str]) -> Standing:
     return Standing(
-        track=Track(row["track"]), policy=row["policy"], reference=row["reference"], scope=row["scope"],
-        is_group=row["pooled"] == "True", is_column=row["column"] == "True", title=row["title"], metric=row["metric"],
-        score=_estimate(row["mean"], row["low"], row["high"]), failed=int(row["failed"]),
-        episodes=int(row["episodes"]), training_seeds=int(row["training_seeds"]),
-        base=_read_paired([row[name] for name in _BASE]), rival=_read_paired([row[name] for name in _RIVAL]),
+        track=Track(row["track"]),
+        policy=row["policy"],
+        reference=row["reference"],
+        scope=row["scope"],
+        is_group=row["pooled"] == "True",
+        is_column=row["column"] == "True",
+        title=row["title"],
+        metric=row["metric"],
+        score=_estimate(row["mean"], row["low"], row["high"]),
+        failed=int(row["failed"]),
+        episodes=int(row["episodes"]),
+        training_seeds=int(row["training_seeds"]),
+        base=_read_paired([row[name] for name in _BASE]),
+        rival=_read_paired([row[name] for name in _RIVAL]),
         step_us=float(row["step_us"]),
-    )  # fmt: skip
+    )
 
 
 def _read_paired(cells: Sequence[str]) -> Paired | None:

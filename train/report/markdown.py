@@ -33,7 +33,11 @@ def markdown(results: Results) -> str:
         parts += [f"## {title}", SCORES, render(scores_table(results.table, columns), "markdown")]
     if results.learning:
         learning = learning_table(results.learning, results.environment.judged)
-        parts += ["## Learning curves", "Share of the base's score, over training seeds.", render(learning, "markdown")]
+        parts += [
+            "## Learning curves",
+            "Share of the base's score, over training seeds.",
+            render(learning, "markdown"),
+        ]
     parts += ["## Notes", _bullets(notes(results))]
     return "\n\n".join(parts) + "\n"
 

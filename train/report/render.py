@@ -28,7 +28,19 @@ from train.runs.escaping import csv_row, markdown_text, script_json, template_va
 if TYPE_CHECKING:
     from jinja2 import Template
 
-Style = Literal["", "bold", "small", "failure", "badge", "pooled", "ceiling", "lower", "higher", "none", "unclear"]
+Style = Literal[
+    "",
+    "bold",
+    "small",
+    "failure",
+    "badge",
+    "pooled",
+    "ceiling",
+    "lower",
+    "higher",
+    "none",
+    "unclear",
+]
 
 _ANY_WIDTH = 10_000
 _WORD = re.compile(r"\S+(?: [^\w\s]+)*")
@@ -39,10 +51,8 @@ _WORD = re.compile(r"\S+(?: [^\w\s]+)*")
 class Part:
     """A piece of a cell.
 
-    Attributes:
-        text: Plain text.
-        style: Look of it: bold; small, on a line below; a failure; a badge; or the colour of a verdict.
-        before: Plain text between it and the part before.
+    Attributes: text: Plain text. style: Look of it: bold; small, on a line below; a failure; a
+        badge; or the colour of a verdict. before: Plain text between it and the part before.
     """
 
     text: str
@@ -57,13 +67,11 @@ Cell = str | tuple[Part, ...]
 class Head:
     """A column of a table.
 
-    Attributes:
-        title: Its title.
-        unit: Unit of its figures; empty without one.
-        second: Second part of the title, on a line of its own where there is room for lines.
-        is_number: Whether it holds figures, to the right, or words.
-        wraps: Whether its words may stand on several lines of a terminal, but for the longest.
-        leaves: Turn in which it is left out where a terminal has no room: 1 before 2; 0 for never. The last one of
+    Attributes: title: Its title. unit: Unit of its figures; empty without one. second: Second part
+        of the title, on a line of its own where there is room for lines. is_number: Whether it
+        holds figures, to the right, or words. wraps: Whether its words may stand on several lines
+        of a terminal, but for the longest. leaves: Turn in which it is left out where a terminal
+        has no room: 1 before 2; 0 for never. The last one of
             those that may leave stays.
         titles: Whether the title of the table may name its value, if it has but one.
     """
@@ -110,14 +118,10 @@ class Row:
 class Table:
     """A table.
 
-    Attributes:
-        heads: Its columns.
-        rows: Its rows.
-        keys: Columns that name a row. Where a terminal or a page repeats them, they stand once, but for the last one.
-        title: Above it on a terminal.
-        subjects: Names before the title.
-        caption: Below it on a terminal.
-        kind: Class of it on a page.
+    Attributes: heads: Its columns. rows: Its rows. keys: Columns that name a row. Where a terminal
+        or a page repeats them, they stand once, but for the last one. title: Above it on a
+        terminal. subjects: Names before the title. caption: Below it on a terminal. kind: Class of
+        it on a page.
     """
 
     heads: tuple[Head, ...]
@@ -175,7 +179,12 @@ def render(table: Table, to: Literal["terminal"]) -> RichTable: ...
 def render(table: Table, to: Literal["markdown", "csv", "html"]) -> str: ...
 def render(table: Table, to: Literal["terminal", "markdown", "csv", "html"]) -> RichTable | str:
     """A table in a format, with its texts escaped for it."""
-    formats: dict[str, Any] = {"terminal": _terminal, "markdown": _markdown, "csv": _csv, "html": _html}
+    formats: dict[str, Any] = {
+        "terminal": _terminal,
+        "markdown": _markdown,
+        "csv": _csv,
+        "html": _html,
+    }
     return formats[to](table)
 
 
@@ -280,7 +289,13 @@ def _markdown(table: Table) -> str:
 def _markdown_cell(cell: Cell) -> str:
     if isinstance(cell, str):
         return markdown_text(cell)
-    looks = {"bold": "**{}**", "small": "<br><sub>{}</sub>", "badge": "({})", "ceiling": "({})", "pooled": "({})"}
+    looks = {
+        "bold": "**{}**",
+        "small": "<br><sub>{}</sub>",
+        "badge": "({})",
+        "ceiling": "({})",
+        "pooled": "({})",
+    }
     return "".join(part.before + looks.get(part.style, "{}").format(markdown_text(part.text)) for part in cell)
 
 

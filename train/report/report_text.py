@@ -123,7 +123,10 @@ def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
     if best is None:
         return f"No policy has a {column.title}.", "No episode reached its end."
     others = [title for title in scores if title != best and scores[title][0].is_known]
-    worst = max(others or [best], key=lambda title: (scores[title][1][0] / scores[title][1][1], scores[title][0].value))
+    worst = max(
+        others or [best],
+        key=lambda title: (scores[title][1][0] / scores[title][1][1], scores[title][0].value),
+    )
     shown = {t: f"{column.scale * scores[t][0].value:.{column.decimals}f} {column.unit}" for t in (best, worst)}
     found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}"
     ahead = [best_of(_scores(rows, column)) == best for _, rows in table.rows.groupby("cell")]
@@ -173,7 +176,10 @@ def facts(results: Results) -> list[tuple[str, str]]:
         ("policies", ", ".join(table.policies)),
         (f"{quantity}s", ", ".join(table.references)),
         ("scenarios", ", ".join(table.scenarios)),
-        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"),
+        (
+            "episodes",
+            f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}",
+        ),
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]
@@ -206,7 +212,8 @@ def in_short(results: Results) -> list[str]:
 
 def of_a_map(heat_map: HeatMap) -> list[str]:
     """Who is best in how many cells of a map, and where learning is ahead of the best policy without it."""
-    where, cells = f"{heat_map.column.title}, {heat_map.title}", heat_map.flat
+    where = f"{heat_map.column.title}, {heat_map.title}"
+    cells = heat_map.flat
     wins = {title: sum(cell.best == title for cell in cells) for title in heat_map.policies}
     ranking = sorted((title for title in wins if wins[title]), key=lambda title: -wins[title])
     found = [
@@ -247,11 +254,19 @@ def claims(results: Results) -> list[str]:
     found = []
     for rival in pooled or (rivals if few else []):
         base = next(
-            row for row in judged
+            row
+            for row in judged
             if not row.is_rival
             and (row.policy, row.reference, row.scope, row.is_group, row.swept, row.column)
-            == (rival.policy, rival.reference, rival.scope, rival.is_group, rival.swept, rival.column)
-        )  # fmt: skip
+            == (
+                rival.policy,
+                rival.reference,
+                rival.scope,
+                rival.is_group,
+                rival.swept,
+                rival.column,
+            )
+        )
         where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
         found.append(
             f"{rival.policy}, {rival.column.title}, {where}{marked(rival)}: {_compared(base)} than {base.base}, its "

@@ -99,14 +99,37 @@ def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
 
 
 def _records(row: RobotScores) -> Iterator[list[object]]:
-    own = [row.policy, row.reference, row.scenario, row.column.metric, *row.mean.cells, *row.middle.cells]
+    own = [
+        row.policy,
+        row.reference,
+        row.scenario,
+        row.column.metric,
+        *row.mean.cells,
+        *row.middle.cells,
+    ]
     own += [*row.worst.cells, row.failed, row.episodes]
     for other, better in row.better.items() or [("", None)]:
         yield [*own, other, *(("",) * 3 if better is None else better.cells)]
 
 
 _HEAD = (
-    "policy", "reference", "scenario", "metric", "mean", "mean_low", "mean_high", "interquartile_mean",
-    "interquartile_mean_low", "interquartile_mean_high", "worst_tenth", "worst_tenth_low", "worst_tenth_high",
-    "failed", "episodes", "against", "better_share", "better_share_low", "better_share_high",
-)  # fmt: skip
+    "policy",
+    "reference",
+    "scenario",
+    "metric",
+    "mean",
+    "mean_low",
+    "mean_high",
+    "interquartile_mean",
+    "interquartile_mean_low",
+    "interquartile_mean_high",
+    "worst_tenth",
+    "worst_tenth_low",
+    "worst_tenth_high",
+    "failed",
+    "episodes",
+    "against",
+    "better_share",
+    "better_share_low",
+    "better_share_high",
+)

@@ -68,7 +68,13 @@ def page_chart(chart: Chart) -> PageChart:
         values = list(chart.ticks)
         ticks = {"type": "log", "tickvals": values, "ticktext": [f"{value:g}" for value in values]}
     layout["xaxis"] = base_axis(chart.label, anchor=f"y{nth(count - 1)}", **ticks)
-    layout["legend"] = {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0, "xanchor": "left"}
+    layout["legend"] = {
+        "orientation": "h",
+        "y": 1.0,
+        "yanchor": "bottom",
+        "x": 0.0,
+        "xanchor": "left",
+    }
     layout["showlegend"] = True
     layout["hovermode"] = "x unified" if len(names) < 7 else "closest"
     layout["shapes"] = [_shade(begin, end) for begin, end in chart.shaded]
@@ -84,7 +90,12 @@ def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
 
 def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
     """A line, below it the band around it."""
-    where = {"type": "scatter", "yaxis": f"y{axis}", "legendgroup": curve.name, **_abscissa(curve.x)}
+    where = {
+        "type": "scatter",
+        "yaxis": f"y{axis}",
+        "legendgroup": curve.name,
+        **_abscissa(curve.x),
+    }
     line = {
         **where,
         "mode": "lines+markers" if curve.has_points else "lines",
@@ -97,7 +108,13 @@ def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
         line["marker"] = {"size": 7}
     if curve.band is None:
         return [line]
-    hidden = {**where, "mode": "lines", "showlegend": False, "hoverinfo": "skip", "line": {"width": 0}}
+    hidden = {
+        **where,
+        "mode": "lines",
+        "showlegend": False,
+        "hoverinfo": "skip",
+        "line": {"width": 0},
+    }
     low, high = curve.band
     filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
     return [{**hidden, "y": numbers(low)}, {**hidden, "y": numbers(high), **filled}, line]

@@ -29,10 +29,8 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
 def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False) -> Table:
     """Median over the episodes of every cell that did not fail, failures beside them.
 
-    Args:
-        evaluations: The cells, of one environment.
-        columns: Metrics to show.
-        worst: Whether the episode that is farthest from zero stands in brackets, where there are several.
+    Args: evaluations: The cells, of one environment. columns: Metrics to show. worst: Whether the
+        episode that is farthest from zero stands in brackets, where there are several.
     """
     known = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
@@ -107,7 +105,10 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
         parts += [f"{title}:", render(summary_table(evaluations, columns, worst=True), "markdown")]
     notes = failure_notes(evaluations)
     if notes:
-        parts += ["Where all episodes failed:", "\n".join(f"* {markdown_text(note)}" for note in notes)]
+        parts += [
+            "Where all episodes failed:",
+            "\n".join(f"* {markdown_text(note)}" for note in notes),
+        ]
     return parts
 
 

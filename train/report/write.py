@@ -11,7 +11,12 @@ from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
 from train.evaluate.table import EpisodeTable, score
 from train.figures.chart import Cells, learning_chart, sweep_chart, time_chart
-from train.figures.comparison_figures import by_option, by_reference, cells_together, swept_scenarios
+from train.figures.comparison_figures import (
+    by_option,
+    by_reference,
+    cells_together,
+    swept_scenarios,
+)
 from train.figures.map_plots import panels
 from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
@@ -46,7 +51,8 @@ def require_plotly() -> str:
 
 def write_report(results: Results) -> list[Path]:
     """Write `report.html` and `report.md` beside the other files of a comparison."""
-    page, text = results.folder / "report.html", results.folder / "report.md"
+    page = results.folder / "report.html"
+    text = results.folder / "report.md"
     write_whole(page, _page(results).html(require_plotly()))
     write_whole(text, markdown(results))
     return [page, text]
@@ -54,7 +60,10 @@ def write_report(results: Results) -> list[Path]:
 
 def _page(results: Results) -> Page:
     known = results.environment
-    page = Page(f"Comparison: {results.name}", f"{capital(known.subject)}; made {results.metadata['created'][:10]}")
+    page = Page(
+        f"Comparison: {results.name}",
+        f"{capital(known.subject)}; made {results.metadata['created'][:10]}",
+    )
     page.section("What was compared", headline(results))
     page.add("definitions", facts(results))
     page.add("bullets", in_short(results))
@@ -118,8 +127,9 @@ def _add_maps(page: Page, results: Results) -> None:
 def _add_ladder(page: Page, results: Results) -> None:
     seeds = (
         " Diamonds are residuals: interquartile mean over training seeds with its 95 % interval."
-        if results.table.members else ""
-    )  # fmt: skip
+        if results.table.members
+        else ""
+    )
     page.section(
         "Ladder of policies",
         f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}",
@@ -128,7 +138,12 @@ def _add_ladder(page: Page, results: Results) -> None:
     for number, reference in enumerate(references):
         chart = ladder(results.table, reference, results.colours)
         title = results.environment.title(reference)
-        page.add("chart", chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
+        page.add(
+            "chart",
+            chart,
+            folded=capital(title) if len(references) > 1 else None,
+            is_open=number < 3,
+        )
 
 
 def _add_changes(page: Page, results: Results) -> None:
