@@ -5,10 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from baselines.residual.residual import ResidualDescription
 from train.evaluate.conditions import Condition, Member, PolicySpec
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 
 METRIC = "pelvis_error_rms_rad"
 
@@ -19,6 +20,13 @@ def records(values: Sequence[float | None], first: int = 0) -> list[dict[str, An
         {"seed": first + i, "termination": "" if value is not None else "fell", METRIC: 9.0 if value is None else value}
         for i, value in enumerate(values)
     ]
+
+
+def episode_rows(episodes: Sequence[dict[str, Any]]) -> pd.DataFrame:
+    """Episodes of one cell as rows of the table of episodes."""
+    frame = pd.DataFrame(episodes)
+    failed = frame["termination"] != ""
+    return frame.assign(member="", cell=0, failed=failed, **{METRIC: frame[METRIC].where(~failed)})
 
 
 def describe(folder: Path, seed: int | None = None, **values: Any) -> Path:

@@ -32,7 +32,7 @@ from train.cells.play import run_conditions
 from train.cells.store import Store
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
-from train.report.changes_tables import write_statistics
+from train.report.change_tables import write_statistics
 from train.report.summary import write_episodes
 from train.workers.calls import Watch, run_calls
 from train.workers.places import Place

@@ -17,7 +17,7 @@ from train.cells.key import cell_key
 from train.cells.play import run_conditions
 from train.cells.store import Store, UnfitCellError, _digest
 from train.evaluate.conditions import Condition, Member, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 
 SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
 CONDITION, OTHER = (

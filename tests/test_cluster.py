@@ -25,7 +25,7 @@ from train.cells.play import run_conditions
 from train.cells.store import Store
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate, evaluate_together
+from train.evaluate.episodes import Evaluation, evaluate, evaluate_together
 from train.learn.run_training import start
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training

@@ -22,29 +22,26 @@ from baselines.catalogue import BEST_ON_THE_WALKER
 from baselines.residual.residual import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
-from tests.cells import METRIC, cell, describe, family, records
+from tests.cells import METRIC, cell, describe, episode_rows, family, records
 from train.commands.cli import main
-from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, level, merged, percent_interval
+from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, merge_seeds, pair, percent_interval
 from train.evaluate.conditions import Condition, Member, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.families import expand
 from train.evaluate.progress import learning_curves
-from train.evaluate.statistics import Estimate, Pairs, change, improvement, interquartile_mean, over_seeds, pair
+from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, wins
+from train.evaluate.table import EpisodeTable, score
 from train.experiments.compare import CompareConfig, _each_once
-from train.figures.figures import has_swept_references
+from train.figures.comparison_figures import has_swept_references
 from train.report import Results, require_jinja2, require_plotly, write_report
-from train.report.changes_tables import changes_table, print_changes, write_statistics
+from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
 from train.report.page import Page
+from train.report.render import render
 from train.runs.folders import run_folder
 
 SHIPPED = Path(__file__).parents[1] / "baselines" / "trained" / "testbed"
 SINE = {"kind": "sine", "amplitude": 0.05, "duration_s": 0.3, "onset_s": 0.2}
 POSITIVE = st.floats(1e-3, 1e3)
-
-
-def pairs(mine: Sequence[float], base: Sequence[float]) -> Pairs:
-    """Pairs of figures."""
-    return Pairs(np.array(mine), np.array(base))
 
 
 # Figures over training seeds.
@@ -86,7 +83,7 @@ def test_one_training_seed_has_no_interval() -> None:
     assert over_seeds([0.5]) == Estimate(0.5)
     assert not over_seeds([0.5, float("nan")]).has_interval
     assert np.isnan(over_seeds([]).value)
-    assert not improvement([[pairs([1.0, 2.0, 3.0], [2.0, 1.0, 4.0])]]).has_interval
+    assert not improvement(np.array([[2.0]]), np.array([[3]])).has_interval
 
 
 # Pairs.
@@ -95,26 +92,30 @@ def test_one_training_seed_has_no_interval() -> None:
 def test_pairs_are_found_by_the_seed_of_the_episode() -> None:
     """Catches pairing by position: shuffled episodes belong together as before."""
     mine, base = records([1.0, 2.0, 3.0]), records([10.0, 20.0, 30.0])
-    shuffled = pair([mine[2], mine[0], mine[1]], base, METRIC)
-    np.testing.assert_array_equal(shuffled.mine / shuffled.base, [0.1, 0.1, 0.1])
+    shuffled = pair(episode_rows([mine[2], mine[0], mine[1]]), episode_rows(base), METRIC)
+    np.testing.assert_array_equal(shuffled["mine"] / shuffled["base"], [0.1, 0.1, 0.1])
     with pytest.raises(ValueError, match="seed of its own"):
-        pair([*mine, mine[0]], base, METRIC)
+        pair(episode_rows([*mine, mine[0]]), episode_rows(base), METRIC)
+    with pytest.raises(ValueError, match="seed of its own"):
+        pair(episode_rows(mine), episode_rows([*base, base[0]]), METRIC)
 
 
 def test_an_episode_in_which_either_fell_is_left_out_of_both() -> None:
     """Catches a fall that is averaged in, and a base that is averaged over other episodes than the policy."""
-    found = pair(records([1.0, None, 3.0, 4.0]), records([2.0, 2.0, None, 8.0]), METRIC)
-    assert (found.mine.tolist(), found.base.tolist(), found.left_out) == ([1.0, 4.0], [2.0, 8.0], 2)
-    assert change([found]) == -0.5
-    only_here = pair(records([1.0, 2.0]), records([2.0, 4.0], first=1), METRIC)
-    assert (only_here.mine.tolist(), only_here.base.tolist(), only_here.left_out) == ([2.0], [2.0], 2)
+    found = pair(episode_rows(records([1.0, None, 3.0, 4.0])), episode_rows(records([2.0, 2.0, None, 8.0])), METRIC)
+    assert (found["mine"].tolist(), found["base"].tolist()) == ([1.0, 4.0], [2.0, 8.0])
+    only_here = pair(episode_rows(records([1.0, 2.0])), episode_rows(records([2.0, 4.0], first=1)), METRIC)
+    assert (only_here["mine"].tolist(), only_here["base"].tolist()) == ([2.0], [2.0])
 
 
 def test_change_pools_means_of_scenarios_and_not_episodes_or_ratios() -> None:
     """Catches a scenario that weighs more because it has more episodes, and a mean of ratios."""
-    many, few = pairs([1.0] * 9, [2.0] * 9), pairs([9.0], [10.0])
-    assert change([many, few]) == pytest.approx((1.0 + 9.0) / (2.0 + 10.0) - 1.0)
-    assert np.isnan(change([many, pairs([], [])]))
+    base = [cell("base", {"all": [2.0] * 9}, "soft"), cell("base", {"all": [10.0]}, "ideal")]
+    other = [cell("other", {"all": [1.0] * 9}, "soft"), cell("other", {"all": [9.0]}, "ideal")]
+    pooled = next(row for row in changes([*base, *other], {"both": ["soft", "ideal"]}) if row.is_group)
+    assert pooled.relative.value == pytest.approx((1.0 + 9.0) / (2.0 + 10.0) - 1.0)
+    assert change(np.array([[1.0, 9.0]]), np.array([[2.0, 10.0]])) == pytest.approx((1.0 + 9.0) / (2.0 + 10.0) - 1.0)
+    assert np.isnan(change(np.array([[1.0, np.nan]]), np.array([[2.0, np.nan]]))).all()
 
 
 @settings(max_examples=50, deadline=None)
@@ -122,13 +123,14 @@ def test_change_pools_means_of_scenarios_and_not_episodes_or_ratios() -> None:
 def test_change_does_not_depend_on_the_unit(values: list[tuple[float, float]], unit: float) -> None:
     """Catches a difference in the place of a ratio."""
     mine, base = np.array(values).T
-    np.testing.assert_allclose(change([Pairs(unit * mine, unit * base)]), change([Pairs(mine, base)]), atol=1e-9)
+    np.testing.assert_allclose(change(unit * mine, unit * base), change(mine, base), atol=1e-9)
 
 
 def test_probability_of_improvement_counts_all_pairs_of_seed_and_episode() -> None:
     """Catches a share of seeds, larger taken for better, and ties that count as wins."""
-    seeds = [[pairs([1.0, 3.0], [2.0, 2.0])], [pairs([1.0, 2.0], [2.0, 2.0])], [pairs([1.0], [2.0])], [pairs([], [])]]
-    found = improvement(seeds)
+    seeds = [([1.0, 3.0], [2.0, 2.0]), ([1.0, 2.0], [2.0, 2.0]), ([1.0], [2.0]), ([], [])]
+    won = np.array([[wins(np.array(mine), np.array(base))] for mine, base in seeds])
+    found = improvement(won, np.array([[len(mine)] for mine, _ in seeds]))
     assert found.value == pytest.approx((1 + 1.5 + 1) / 5)
     assert found.low is not None
     assert found.low == pytest.approx(0.5)
@@ -260,7 +262,7 @@ def test_a_group_without_a_pair_in_one_of_its_scenarios_has_no_figures() -> None
     assert pooled.sentence.startswith("nothing to compare: in one of the scenarios there is no episode in which both")
     page = Page("x", "")
     page.section("Changes")
-    page.add("changes", {"lines": [[pooled]], "colour": {"learned": "red"}, "swept": []})
+    page.add("table", changes_table([pooled], {"learned": "red"}))
     assert "nan" not in (html := page.html(plotly_js=""))
     assert pooled.sentence in html
 
@@ -440,8 +442,9 @@ def test_a_swept_residual_is_compared_with_its_base_at_the_same_value() -> None:
 def test_levels_and_merged_cells_keep_every_training_seed() -> None:
     """Catches a family that shows its first seed alone: in the ladder, and in the summary."""
     cells = family([[1.0, 3.0], [4.0, None], [6.0, 6.0]])
-    assert level(cells, cells[0].condition.environment.judged[0]).value == pytest.approx((2.0 + 4.0 + 6.0) / 3.0)
-    together = merged([cell("base", {"all": [2.0]}, "soft"), *cells])
+    found = score(EpisodeTable(cells).rows, cells[0].condition.environment.judged[0])
+    assert found.value == pytest.approx((2.0 + 4.0 + 6.0) / 3.0)
+    together = merge_seeds([cell("base", {"all": [2.0]}, "soft"), *cells])
     assert [(e.condition.policy.title, len(e.episodes), e.num_failed) for e in together] == [
         ("base", 1, 0), ("learned", 6, 1),
     ]  # fmt: skip
@@ -700,7 +703,7 @@ def test_tables_tell_falls_and_intervals_that_include_zero() -> None:
     for seeds, expected in ((few, "? "), ([*few, [1.0, 1.0], [3.0, 3.0]], "* ")):
         rows = changes([base, *family(seeds)])
         console = Console(width=160, record=True, file=StringIO())
-        console.print(changes_table([row for row in rows if row.is_family]))
+        console.print(render(cells_table([row for row in rows if row.is_family]), "terminal"))
         text = console.export_text()
         assert f"! 1/{2 * len(seeds)} (0/2)" in text
         row = next(row for row in rows if row.is_family and row.is_judged)

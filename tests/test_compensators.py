@@ -23,7 +23,8 @@ from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, rigid_spec
 from elastic_env.runtime.robot_model import RobotModel
 from tests.trees import bias_of_mujoco, pendulum, robot, tree
-from train.evaluate.evaluate import Condition, PolicySpec, evaluate
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.episodes import evaluate
 
 G = 60.0  # torque of the pendulum at the horizontal [N·m]
 STIFFNESSES = pytest.mark.parametrize("K", [1001.0, 300.0])

@@ -20,7 +20,8 @@ from rich.table import Table
 from rich.text import Text
 
 from train.report.page import Page
-from train.report.parts import Chart
+from train.report.render import Table as ReportTable
+from train.report.specs import PageChart
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.escaping import (
     chart_text,
@@ -215,8 +216,8 @@ def page_of(text: str) -> str:
     page.add("heading", text, folded=text)
     page.add("bullets", [text])
     page.add("definitions", [(text, text)])
-    page.add("table", {"head": [text], "rows": [[text]], "words": 1})
-    page.add("chart", Chart({"name": text}, height=100))
+    page.add("table", ReportTable.plain([text], [[text]], subjects=(text,)))
+    page.add("chart", PageChart({"name": text}, height=100))
     return page.html(plotly_js="0")
 
 

@@ -20,7 +20,7 @@ from rich.console import Console
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import PolicyFailedError, blamed
+from train.evaluate.rollout import PolicyFailedError, policy_errors
 from train.runs.failures import EndedError, explained
 from train.runs.progress import duration, plain_progress
 from train.workers.calls import WorkerKilledError
@@ -149,7 +149,7 @@ def test_whatever_a_policy_raises_is_the_policys(error: BaseException) -> None:
         pytest.raises(
             PolicyFailedError, match=r"'mine.py:policy' failed in scenario 'nominal', sine, at control step 3"
         ),
-        blamed(CELL, 3),
+        policy_errors(CELL, 3),
     ):
         raise error
 
@@ -157,7 +157,7 @@ def test_whatever_a_policy_raises_is_the_policys(error: BaseException) -> None:
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space"), MemoryError(), SystemFailedError("gone")])
 def test_what_the_system_does_is_not_the_policys(error: Exception) -> None:
     """Catches a full disk that is put down to the policy that met it."""
-    with pytest.raises(type(error)) as caught, blamed(CELL, 3):
+    with pytest.raises(type(error)) as caught, policy_errors(CELL, 3):
         raise error
     assert caught.value is error
 

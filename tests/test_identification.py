@@ -19,7 +19,8 @@ from elastic_env.motion.references import Hold
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.runtime.scenario import make_scenario
 from tests.trees import pendulum
-from train.evaluate.evaluate import Condition, Evaluation, PolicySpec, evaluate
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.episodes import Evaluation, evaluate
 
 ID = "elastic_env/Testbed-v0"
 G = 60.0  # torque of the pendulum at the horizontal [N·m]

@@ -21,7 +21,7 @@ from baselines.walking.zmp_shift import center_of_mass_shift
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import evaluate
+from train.evaluate.episodes import evaluate
 from train.experiments.iterate import IterateConfig, iterate
 
 PERIOD_S = 0.004

@@ -21,22 +21,23 @@ from tests.cells import METRIC, cell, family
 from train.commands.cli import main
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
-from train.evaluate.leaderboard import Paired, Standing, standings
+from train.evaluate.episodes import Evaluation, evaluate
+from train.evaluate.standings import Paired, Standing, standings
 from train.evaluate.statistics import Estimate, over_seeds
 from train.experiments.compare import CompareConfig, Sweep
 from train.experiments.timing import step_times
 from train.report import Results, write_report
 from train.report.leaderboard import (
     board,
+    claims_table,
     leaderboard_markdown,
-    paired_rows,
     print_leaderboard,
     read_leaderboard,
     scenarios_board,
     three_digits,
     write_leaderboard,
 )
+from train.report.render import Cell, Table, plain_text
 from train.runs.folders import run_folder
 
 ROOT = Path(__file__).parents[1]
@@ -92,6 +93,22 @@ def change_to(paired: Paired | None) -> Estimate:
     return paired.change
 
 
+def tracks(table: Table) -> dict[str, dict[str, tuple[Cell, ...]]]:
+    """Cells of every policy, by track and title."""
+    found: dict[str, dict[str, tuple[Cell, ...]]] = {}
+    for line in table.rows:
+        if line.kind == "heading":
+            own = found.setdefault(plain_text(line.cells[0]), {})
+        else:
+            own[plain_text(line.cells[0])] = line.cells[1:]
+    return found
+
+
+def titles(table: Table) -> list[str]:
+    """Titles of the columns, on one line each, without those of policy and totals."""
+    return [head.label for head in table.heads if head.leaves]
+
+
 # Scores.
 
 
@@ -127,13 +144,13 @@ def test_a_residual_is_compared_with_the_best_of_each_column() -> None:
 
 def test_columns_are_whole_groups_and_what_is_in_none() -> None:
     """Catches a group that is shown though one of its scenarios is not played, and a scenario that nobody sees."""
-    assert board(rows()).columns == (("both", "3 s"), ("all", "3 s"), ("soft", "1.6 s"))
+    assert titles(board(rows())) == ["both, 3 s", "all, 3 s", "soft, 1.6 s"]
     single = scenarios_board(rows())
     assert single is not None
-    assert single.columns == (("soft", "3 s"), ("ideal", "3 s"), ("slope", "3 s"))
+    assert titles(single) == ["soft, 3 s", "ideal, 3 s", "slope, 3 s"]
     found = [e for e in played() if e.condition.reference == 3]
     without = standings(found, changes(found), {}, {})
-    assert board(without).columns == single.columns
+    assert titles(board(without)) == titles(single)
     assert scenarios_board(without) is None
 
 
@@ -142,8 +159,7 @@ def test_columns_are_whole_groups_and_what_is_in_none() -> None:
 
 def test_tracks_hold_those_with_the_same_needs_the_best_first() -> None:
     """Catches a policy of one's own in the wrong track, and an order by name."""
-    tracks = {name: [r.policy for r in own] for name, own in board(rows()).tracks}
-    assert tracks == {
+    assert {name: list(own) for name, own in tracks(board(rows())).items()} == {
         str(Track.STANDARD): ["best", "base"], str(Track.TORQUE_SENSORS): ["sensor"], str(Track.TRAINING): ["learned"],
     }  # fmt: skip
     condition = Condition(env="walker", policy=PolicySpec(name="mine.py:make"))
@@ -154,13 +170,20 @@ def test_tracks_hold_those_with_the_same_needs_the_best_first() -> None:
 
 def test_the_best_of_a_track_has_the_fewest_falls_first() -> None:
     """Catches a mark for who fell in the hard episodes, and a track without any."""
-    (_, (best, base)), (_, (sensor,)), _ = board(rows()).tracks
-    assert [entry.is_best for entry in (best.entries[0], base.entries[0])] == [(False, False), (True, True)]
-    assert (best.entries[0].figures[0], best.entries[0].failed) == ("2500", "✕1/3")
-    assert [entry.is_best for entry in sensor.entries[:2]] == [(True, True)] * 2
-    assert best.entries[2].figures == ("not played",)
-    assert (best.failed, best.step, base.failed, base.step) == ("1/4", "31", "0/5", "20")
-    assert sensor.step == "-"
+    standard, sensors, _ = tracks(board(rows())).values()
+    best, base, sensor = standard["best"], standard["base"], sensors["sensor"]
+    assert [bolds(cells[0]) for cells in (best, base)] == [[False, False], [True, True]]
+    assert [bolds(cell) for cell in sensor[:2]] == [[True, True]] * 2
+    assert plain_text(best[0]) == "2500 / 2500 ✕1/3"
+    assert plain_text(best[2]) == "not played"
+    assert (best[-2:], base[-2:]) == (("1/4", "31"), ("0/5", "20"))
+    assert sensor[-1] == "-"
+
+
+def bolds(cell: Cell) -> list[bool]:
+    """Whether each figure of a cell is bold."""
+    assert isinstance(cell, tuple)
+    return [part.style == "bold" for part in cell[:2]]
 
 
 @pytest.mark.parametrize(
@@ -202,14 +225,15 @@ def test_all_forms_have_the_same_figures() -> None:
     assert re.findall(r"<h2 id=\"s\d+\">([^<]*)</h2>", page)[1] == "Leaderboard"
     assert "<b>6000</b> / <b>6000</b></td>" in page
     assert '2500 / 2500 <span class="falls">✕1/3</span>' in page
-    head, lines = paired_rows(rows())
-    assert head[2:4] == [
+    table = claims_table(rows())
+    lines = [[plain_text(cell) for cell in line.cells] for line in table.rows]
+    assert [head.title for head in table.heads[2:4]] == [
         f"pelvis error rms, against {other}" for other in ("its base", "the best policy without learning")
     ]
     assert [line[:2] for line in lines] == [["learned", "both, 3 s"], ["learned", "all, 3 s"]]
     assert (lines[0][2].endswith("(base)"), lines[0][3]) == (True, "the same")
     single = [replace(s, is_column=True) for s in rows() if s.scope == "slope"]
-    assert paired_rows(single)[1][0][3].endswith("(best)")
+    assert plain_text(claims_table(single).rows[0].cells[3]).endswith("(best)")
 
 
 def test_the_terminal_has_the_columns_that_it_has_room_for() -> None:
@@ -219,7 +243,7 @@ def test_the_terminal_has_the_columns_that_it_has_room_for() -> None:
         print_leaderboard(rows(), console)
         text = console.export_text(clear=False)
         assert "6000 / 6000" in text
-        assert ("✕1/3" in text) == is_whole
+        assert "✕1/3" in text
         assert ("no room for" not in text) == is_whole
         assert ("soft, 1.6 s" in text) != is_whole
         assert "\x1b[1m6000\x1b[0m / \x1b[1m6000" in console.export_text(styles=True)

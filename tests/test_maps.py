@@ -17,14 +17,15 @@ from elastic_env.runtime.scenario import make_scenario
 from tests.cells import METRIC, cell, family
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, varied
-from train.evaluate.evaluate import Evaluation, make_vector_env
+from train.evaluate.episodes import Evaluation
 from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
+from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
 from train.experiments.compare import CompareConfig
-from train.figures.figures import draw_maps
+from train.figures.comparison_figures import draw_maps
 from train.figures.map_plots import Square, blended, panels
 from train.report import Results, write_report
-from train.report.changes_tables import write_maps
+from train.report.change_tables import write_maps
 from train.runs.folders import run_folder
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -19,7 +19,7 @@ from elastic_env.robots.gallery import gallery_robot
 from train.commands.cli import main
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import make_policy
+from train.evaluate.rollout import make_policy
 from train.experiments.bench import BenchConfig
 from train.experiments.compare import CompareConfig
 from train.learn.algorithms import algorithm_class

@@ -15,7 +15,7 @@ from elastic_env.core.signals import Array
 from train.cells import play
 from train.cells.play import in_batches
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import evaluate, evaluate_together
+from train.evaluate.episodes import evaluate, evaluate_together
 
 ID = "elastic_env/WalkInPlace-v0"
 SHORT: dict[str, Any] = {"step_period": [0.2, 0.3, 0.2], "num_steps": 1}
@@ -164,7 +164,7 @@ def failing(env: Any) -> Any:
 
 def test_of_cells_that_were_to_be_played_together_each_says_whether_it_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a failure in one scenario that takes the results of the others with it, or has another's name."""
-    monkeypatch.setattr(play, "plays_beside_others", lambda condition: True)
+    monkeypatch.setattr(play, "can_share_worlds", lambda condition: True)
     cells = [cell(f"{__name__}:failing", scenario) for scenario in ("payload", "nominal")]
     failed, passed = play._evaluate(cells, lambda _: None)
     assert failed.error is not None

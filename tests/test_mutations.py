@@ -21,8 +21,8 @@ from elastic_env.runtime.physics import substeps
 from tests.mutations import RESIDUALS
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import make_policy
 from train.evaluate.families import expand
+from train.evaluate.rollout import make_policy
 from train.experiments.bench import BenchConfig
 from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds

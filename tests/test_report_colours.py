@@ -8,9 +8,8 @@ import pytest
 
 from tests.test_leaderboard import GROUPS, played
 from train.evaluate.changes import changes
-from train.figures.plots import COLOURS, STRONG
+from train.figures.colours import COLOURS, FRAME, GRID, INK, LINE, NIGHT, REFERENCE, SHADE, STRONG, VERDICTS
 from train.report import Results, write_report
-from train.report.parts import FRAME, GRID, INK, LINE, NIGHT, REFERENCE, SHADE, VERDICTS
 from train.runs.folders import run_folder
 
 PAPER = NIGHT["white"]

@@ -15,17 +15,18 @@ from scipy import stats
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.runtime.scenario import TRAINING_RANGES, make_scenario
-from tests.cells import METRIC, cell, family, records
+from tests.cells import METRIC, cell, episode_rows, family, records
 from train.evaluate.changes import HELD_OUT, changes
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import evaluate, make_vector_env
+from train.evaluate.episodes import evaluate
 from train.evaluate.families import Origin
-from train.evaluate.robots import robot_scores
-from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
+from train.evaluate.robots import robot_scores, share_better
+from train.evaluate.rollout import make_vector_env
+from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, worst_share_mean
 from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds
 from train.report import Results, write_report
-from train.report.robots_tables import print_robots, robots_table, write_robots
+from train.report.score_tables import print_robots, robots_table, write_robots
 from train.runs.folders import run_folder
 
 OWN = {"load_kg": [0.0, 2.0]}
@@ -69,13 +70,15 @@ def test_the_worst_tenth_lies_between_mean_and_highest(values: list[float]) -> N
 
 def test_a_robot_that_falls_is_worse_off_than_any_other() -> None:
     """Catches falls that are left out, which would flatter who falls on the difficult robots."""
-    mine, base = records([1.0, None, 3.0, None, 2.0]), records([2.0, 2.0, None, None, 2.0])
+    mine, base = episode_rows(records([1.0, None, 3.0, None, 2.0])), episode_rows(records([2.0, 2.0, None, None, 2.0]))
     assert share_better(mine, base, METRIC) == pytest.approx((1.0 + 0.0 + 1.0 + 0.5 + 0.5) / 5.0)
     assert share_better(base, mine, METRIC) == pytest.approx(1.0 - share_better(mine, base, METRIC))
     assert share_better(mine[::-1], base, METRIC) == share_better(mine, base, METRIC)
-    assert np.isnan(share_better(mine, records([1.0], first=50), METRIC))
+    assert np.isnan(share_better(mine, episode_rows(records([1.0], first=50)), METRIC))
     without = [{**record, METRIC: float("nan")} for record in records([1.0])]
-    assert share_better(without + records([1.0], first=1), records([2.0, 2.0]), METRIC) == 1.0
+    assert (
+        share_better(episode_rows(without + records([1.0], first=1)), episode_rows(records([2.0, 2.0])), METRIC) == 1.0
+    )
 
 
 # Cells.
@@ -110,8 +113,8 @@ def test_file_and_tables_say_what_was_found(tmp_path: Path) -> None:
     assert found == pytest.approx([5e-3, 4e-3, 14e-3])
     better = [row["better_share"] for row in written if row["metric"] == METRIC and row["against"] == "base"]
     assert better == ["1.0"]
-    head, table = robots_table(rows)
-    shown = dict(zip(head, table[0], strict=True))
+    table = robots_table(rows)
+    shown = {head.title: cell for head, cell in zip(table.heads, table.rows[0].cells, strict=True)}
     assert [shown[name] for name in ("mean", "interquartile mean", "worst tenth", "falls")] == [
         "5.00", "4.00", "14.00", "0/10",
     ]  # fmt: skip
@@ -212,7 +215,7 @@ def test_other_ranges_than_those_of_training_are_held_out(
 ) -> None:
     """Catches a robot beyond the trained ranges under the name of the trained scenario."""
     known = Origin(("drawn",), None, (), (), (), trained)
-    monkeypatch.setattr("train.evaluate.changes.families", lambda _: {"learned": known})
+    monkeypatch.setattr("train.evaluate.table.EpisodeTable.families", {"learned": known})
     cells = [cell("base", {"all": [1.0] * 4}, "drawn"), *family([[1.0] * 4], "drawn")]
     for e in cells:
         e.condition = e.condition.replace(ranges=played)

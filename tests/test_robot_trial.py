@@ -23,7 +23,7 @@ from tests.gallery_files import FOLDER
 from train.commands.cli import main
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.experiments.robot import POLICIES, RobotTrial, joint_shares, rest_poses, robot_arguments, try_robot
 
 QUICK, SEVERAL = Poses(positions=1, move_s=0.8, settle_s=0.6, measure_s=0.1), Poses(positions=5)

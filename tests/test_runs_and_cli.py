@@ -22,7 +22,7 @@ import yaml
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-import train.evaluate.evaluate
+import train.evaluate.episodes
 import train.experiments.compare
 import train.experiments.demo
 import train.report.summary
@@ -37,7 +37,7 @@ from elastic_env.runtime.joint_task import METRICS_OF_ONE as METRICS
 from tests.test_identification import synthetic
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate
+from train.evaluate.episodes import Evaluation, evaluate
 from train.experiments.compare import CompareConfig
 from train.experiments.play import play
 from train.runs.folders import new_run, run_folder
@@ -116,7 +116,7 @@ def test_records_do_not_depend_on_how_episodes_are_batched(monkeypatch: pytest.M
     """Catches episodes lost or repeated where there are more of them than worlds."""
     cell = condition(reference=MULTISINE, episodes=5)
     whole = evaluate(cell, num_threads=1)
-    monkeypatch.setattr(train.evaluate.evaluate, "MOST_WORLDS", 2)
+    monkeypatch.setattr(train.evaluate.episodes, "MOST_WORLDS", 2)
     parts = evaluate(cell, num_threads=1)
     assert parts.episodes == whole.episodes
     np.testing.assert_array_equal(parts.trace["link_angle"], whole.trace["link_angle"])
@@ -323,7 +323,7 @@ def test_failed_episodes_are_counted_and_not_averaged_in() -> None:
         for reason, value in (("", 0.001), ("diverged", 9.0), ("", 0.003), ("diverged", float("nan")))
     ]
     table = Console(width=160, record=True, file=StringIO())
-    table.print(train.report.summary.summary_table([Evaluation(condition(), episodes)]))
+    train.report.summary.print_summary([Evaluation(condition(), episodes)], table)
     row = next(line for line in table.export_text().splitlines() if "input" in line)
     assert "2.00" in row
     assert "2/4" in row

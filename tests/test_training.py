@@ -28,8 +28,9 @@ from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from train.commands.cli import main
-from train.evaluate.evaluate import evaluate, make_vector_env
+from train.evaluate.episodes import evaluate
 from train.evaluate.progress import read_progress
+from train.evaluate.rollout import make_vector_env
 from train.experiments.bench import BenchCase
 from train.learn.constant_search import ConstantSearch
 from train.learn.curves import Curves

@@ -24,14 +24,15 @@ from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.runtime.robot_model import WalkerModel
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import Evaluation, evaluate, make_vector_env
+from train.evaluate.episodes import Evaluation, evaluate
+from train.evaluate.rollout import make_vector_env
 from train.evaluate.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
 from train.experiments.compare import CompareConfig, try_out
-from train.figures.figures import figure_name, option_curves, reference_curves
-from train.figures.sweep_plots import draw_sweep
-from train.figures.walk_plots import draw_pelvis, draw_zmp, intervals
+from train.figures.chart import intervals, sweep_chart
+from train.figures.colours import policy_colours
+from train.figures.comparison_figures import by_option, by_reference, draw_pelvis, draw_sweep, draw_zmp, figure_name
 from train.learn.train_config import TrainConfig
-from train.report.summary import failure_notes, print_summary, summary_table, write_summary
+from train.report.summary import failure_notes, print_summary, write_summary
 from train.speed.contenders import RawWorlds, VectorLoop
 
 SHORT = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
@@ -231,7 +232,7 @@ def test_a_fall_is_counted_and_not_scored(fallen: Evaluation) -> None:
     assert fallen.trace["time_s"][-1] == pytest.approx(fallen.episodes[0]["duration_s"])
     assert fallen.trace["time_s"][-1] < 4.5
     table = Console(width=160, record=True, file=StringIO())
-    table.print(summary_table([fallen]))
+    print_summary([fallen], table)
     row = next(line for line in table.export_text().splitlines() if "zero" in line)
     assert row.split()[-1] == "1/1"
     assert not any(character.isdigit() for character in row.split("zero")[1].replace("1/1", ""))
@@ -361,20 +362,25 @@ def test_sweeps_have_a_curve_per_policy_and_gaps_where_all_fell() -> None:
     cells = config.conditions()
     assert [cell.policy_options for cell in cells] == [{"stiffness_scale": x} for x in (2.0, 0.5, 1.0)] + [{}]
     ends = [[("", 0.03)], [("fell", 9.0)], [("", 0.01), ("fell", 9.0)], [("", 0.002)]]
-    input_curve, level = option_curves([made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)])
+    played = [made_up(cell, *end) for cell, end in zip(cells, ends, strict=True)]
+    points = by_option(played)
+    chart = sweep_chart(points, [cells[0].environment.overview], "", policy_colours(list(points)))
+    input_curve, level = chart.panels[0].curves
     np.testing.assert_array_equal(input_curve.x, [0.5, 1.0, 2.0])
-    np.testing.assert_array_equal(input_curve.failed_share, [1.0, 0.5, 0.0])
-    np.testing.assert_allclose(input_curve.median(cells[0].environment.overview), [np.nan, 10.0, 30.0])
-    assert level.is_level
-    assert not input_curve.is_level
-    with Image.open(draw_sweep([input_curve, level], "assumed over true stiffness", Path("s.png"))) as image:
+    np.testing.assert_allclose(input_curve.y, [np.nan, 10.0, 30.0])
+    np.testing.assert_allclose(level.y, [2.0, 2.0])
+    assert (input_curve.dash, level.dash) == ("solid", "dot")
+    (failing,) = chart.failing
+    assert (failing.x, failing.is_all) == ([0.5, 1.0], [True, False])
+    with Image.open(draw_sweep(played, points, "assumed over true stiffness", Path("s.png"))) as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20
 
 
 def test_references_are_swept_by_their_step_period() -> None:
     """Catches a list of durations that has no place on the axis."""
     references = [3, [0.8, 0.6, 0.8], {"step_period": 24, "num_steps": 2}]
-    (curve,) = reference_curves([made_up(walk(reference=reference), ("", 0.01)) for reference in references])
+    points = by_reference([made_up(walk(reference=reference), ("", 0.01)) for reference in references])
+    (curve,) = sweep_chart(points, [walk().environment.overview], "", {"input": "#000000"}).panels[0].curves
     np.testing.assert_allclose(curve.x, [2.2, 3.0, 24.0])
 
 
@@ -425,13 +431,13 @@ def test_compare_of_walks_writes_tables_and_the_figures_of_the_chosen_policies(
     """Catches files that are lost or not named, and figures with policies that they should not show."""
     drawn: list[list[str]] = []
     for name in ("pelvis", "zmp"):
-        draw = train.figures.figures._FIGURES[name]
+        draw = train.figures.comparison_figures._FIGURES[name]
 
         def record(evaluations: Sequence[Evaluation], path: Path, draw: Any = draw) -> Path:
             drawn.append([e.condition.policy.title for e in evaluations])
             return draw(evaluations, path)
 
-        monkeypatch.setitem(train.figures.figures._FIGURES, name, record)
+        monkeypatch.setitem(train.figures.comparison_figures._FIGURES, name, record)
     content = {
         "name": "walks", "env": "walker", "references": [SHORT], "scenarios": ["ideal"],
         "policies": ["zero", "input", {"name": "zero", "label": "rigid", "env_options": {"form": "rigid"}}],

@@ -28,7 +28,7 @@ from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.model import Pendulum
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import make_policy
+from train.evaluate.rollout import make_policy
 from train.runs.folders import run_folder
 
 _SHOWN_S = 1.0

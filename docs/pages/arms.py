@@ -5,14 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.stats import bootstrap
 
-from docs.pages.cells import Rows, minus
+from docs.pages.cells import Rows, minus, page_table
 from elastic_env.core.signals import Array
-from train.evaluate.evaluate import grouped
-from train.runs.escaping import markdown_table
+from train.evaluate.episodes import group_by
 
 _FIRST = "panda"
 """Robot of the gallery that README begins with."""
-_POLICIES, _TOOL = ("input", "link_encoder"), "end_effector_error_rms_m"
+_POLICIES = ("input", "link_encoder")
+_TOOL = "end_effector_error_rms_m"
 """Policies of an arm that are compared, and by what."""
 
 
@@ -25,22 +25,27 @@ def one_arm(gallery: Rows) -> str:
     ]
     head = [f"{row['title']}, sag at rest [mm]", "without compensation", "`input`"]
     lines = [["K as assumed", *shown[0]], ["K 30 % softer than assumed", *shown[1]]]
-    return markdown_table(head, ["---", "---:", "---:"], lines) + "\n"
+    return page_table(head, lines)
 
 
 def link_encoders(episodes: Rows) -> str:
     """What encoders on the links of an arm are worth: error of the end effector, episode by episode."""
     rows = []
-    for scenario, own in grouped(episodes, lambda row: row["scenario"]).items():
+    for scenario, own in group_by(episodes, lambda row: row["scenario"]).items():
         errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES}
         base, other = (errors[policy] for policy in _POLICIES)
         ends = bootstrap(
-            (base, other), _change, paired=True, vectorized=True, method="BCa", rng=np.random.default_rng(0)
+            (base, other),
+            _change,
+            paired=True,
+            vectorized=True,
+            method="BCa",
+            rng=np.random.default_rng(0),
         ).confidence_interval
         change = f"{_percent(_change(base, other))} [{_percent(ends.low)}, {_percent(ends.high)}]"
         rows.append([f"`{scenario}`", f"{1e3 * base.mean():.2f}", f"{1e3 * other.mean():.2f}", change])
     head = ["scenario", *(f"`{policy}` [mm]" for policy in _POLICIES), "change"]
-    return markdown_table(head, ["---", "---:", "---:", "---:"], rows) + "\n"
+    return page_table(head, rows)
 
 
 def _change(base: Array, other: Array, axis: int = -1) -> Array:
@@ -53,16 +58,19 @@ def _percent(value: float | Array) -> str:
 
 def arm_identification(rows: Rows) -> str:
     """How well the stiffness of an arm is found over many logs of known truth, from `tests.identification_trials`."""
-    kinds = grouped(rows, lambda row: (row["poses"], row["log"]))
-    joints = grouped(rows, lambda row: row["joint"])
+    kinds = group_by(rows, lambda row: (row["poses"], row["log"]))
+    joints = group_by(rows, lambda row: row["joint"])
     head = ["", *(f"{poses} poses, {log}" for poses, log in kinds)]
     counted = [[f"`{joint}`", *(_counted(row) for row in own)] for joint, own in joints.items()]
     arm = [own[0] for own in kinds.values()]
     errors = [
         ["**error before [mm]**", *(f"{1e3 * float(row['before_median_m']):.1f}" for row in arm)],
-        ["**error after [mm], median, largest**", *(_two(row, "after_median_m", "after_most_m") for row in arm)],
+        [
+            "**error after [mm], median, largest**",
+            *(_two(row, "after_median_m", "after_most_m") for row in arm),
+        ],
     ]
-    return markdown_table(head, ["---", *["---:"] * len(kinds)], [*counted, *errors]) + "\n"
+    return page_table(head, [*counted, *errors])
 
 
 def _counted(row: Mapping[str, str]) -> str:

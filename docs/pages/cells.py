@@ -13,7 +13,8 @@ import numpy as np
 import yaml
 
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.evaluate import grouped
+from train.evaluate.episodes import group_by
+from train.report.render import Table, render
 from train.runs.escaping import write_csv
 
 Rows = Sequence[Mapping[str, str]]
@@ -40,7 +41,12 @@ class Kept:
 
 
 _WALK = ("pelvis_error_rms_rad", "zmp_deviation_rms_m")
-_ATTITUDE = ("pelvis_roll_rms_rad", "pelvis_roll_peak_rad", "pelvis_pitch_rms_rad", "pelvis_pitch_peak_rad")
+_ATTITUDE = (
+    "pelvis_roll_rms_rad",
+    "pelvis_roll_peak_rad",
+    "pelvis_pitch_rms_rad",
+    "pelvis_pitch_peak_rad",
+)
 _ZMP = ("zmp_deviation_rms_m", "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
 _FEET = ("early_touchdown_mean_s", "frame_error_mean_m", "com_jump_mean_m")
 _ENDS = ("link_error_imu_min_rad", "link_error_imu_max_rad")
@@ -71,7 +77,7 @@ def condensed(episodes: Rows, kept: Kept) -> Iterator[list[object]]:
     """Head and rows of the table that is kept of the episodes of a comparison."""
     yield [*_PLACE, "statistic", "episodes", "failed", *kept.metrics]
     played = [row for row in episodes if all(row[name] in own for name, own in kept.only.items())]
-    for names, own in grouped(played, lambda row: tuple(row[name] for name in _PLACE)).items():
+    for names, own in group_by(played, lambda row: tuple(row[name] for name in _PLACE)).items():
         stood = [row for row in own if not row["termination"]]
         for statistic in kept.statistics:
             values = (_over([row[m] for row in stood], _STATISTICS[statistic]) for m in kept.metrics)
@@ -158,6 +164,11 @@ def shown(row: Mapping[str, str], metrics: Iterable[str], decimals: int, between
     """Metrics side by side with so many decimals, - where there is none."""
     values = (scaled(row, metric) for metric in metrics)
     return between.join("-" if math.isnan(value) else minus(f"{value:.{decimals}f}") for value in values)
+
+
+def page_table(head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1) -> str:
+    """A table of a page, whose first columns hold words and the others figures."""
+    return render(Table.plain(head, rows, words), "markdown") + "\n"
 
 
 def minus(text: str) -> str:

@@ -1,6 +1,7 @@
 """Short films of the docs: the same motion without compensation on the left, and with compensation on the right.
 
-`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated WebP.
+`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated
+WebP.
 """
 
 import sys
@@ -21,23 +22,22 @@ from rich.console import Console  # noqa: E402
 
 from elastic_env.rendering.picture import Image, with_text  # noqa: E402
 from train.evaluate.conditions import Condition, PolicySpec  # noqa: E402
-from train.evaluate.evaluate import make_policy  # noqa: E402
+from train.evaluate.rollout import make_policy  # noqa: E402
 from train.experiments.play import episode  # noqa: E402
 from train.experiments.robot import RobotTrial, robot_arguments  # noqa: E402
 
-_FRAMES_PER_S, _QUALITY = 12.5, 40
+_FRAMES_PER_S = 12.5
+_QUALITY = 40
 
 
 @dataclass(frozen=True)
 class Film:
     """A motion that two policies play.
 
-    Attributes:
-        condition: What is played; its policy is the one without compensation.
-        compensated: The policy on the right.
-        begin_s, end_s: What is shown of the episode [s].
-        box: Left, upper, right and lower edge of what is shown [pixels]; caption and legend are left out.
-        width: Of each of the two pictures [pixels].
+    Attributes: condition: What is played; its policy is the one without compensation. compensated:
+        The policy on the right. begin_s, end_s: What is shown of the episode [s]. box: Left, upper,
+        right and lower edge of what is shown [pixels]; caption and legend are left out. width: Of
+        each of the two pictures [pixels].
     """
 
     condition: Condition
@@ -53,11 +53,21 @@ def films() -> dict[str, Film]:
     robot = robot_arguments(RobotTrial(model="panda"))
     circle = {"kind": "circle", "radius": 0.12, "duration_s": 5.0}
     return {
-        "walk": Film(Condition(env="walker", policy=_named("uncompensated"), reference=3), "input_output", 4.0, 9.0,
-                     (120, 86, 640, 690)),
-        "arm": Film(Condition(env="robot", policy=_named("uncompensated"), reference=circle, env_options=robot),
-                    "input", 1.0, 6.0, (180, 140, 580, 380)),
-    }  # fmt: skip
+        "walk": Film(
+            Condition(env="walker", policy=_named("uncompensated"), reference=3),
+            "input_output",
+            4.0,
+            9.0,
+            (120, 86, 640, 690),
+        ),
+        "arm": Film(
+            Condition(env="robot", policy=_named("uncompensated"), reference=circle, env_options=robot),
+            "input",
+            1.0,
+            6.0,
+            (180, 140, 580, 380),
+        ),
+    }
 
 
 def _named(name: str) -> PolicySpec:
@@ -69,7 +79,8 @@ def frames(film: Film, policy: str, console: Console) -> Iterator[Image]:
     condition = film.condition.replace(policy=_named(policy))
     env: Any = gymnasium.make(condition.environment.id, render_mode="rgb_array", **condition.arguments)
     period = env.unwrapped.task.assumed_model.control_period_s
-    every, title = round(1.0 / (_FRAMES_PER_S * period)), "without" if policy == "uncompensated" else "with"
+    every = round(1.0 / (_FRAMES_PER_S * period))
+    title = "without" if policy == "uncompensated" else "with"
     with closing(env):
         played = episode(env, make_policy(condition.policy, env), condition, round(film.end_s / period), console)
         for step, _ in played:
@@ -86,7 +97,10 @@ def _cut(image: Image, film: Film, title: str) -> Image:
 
 def write(film: Film, path: Path, console: Console) -> Path:
     """Play both sides and write the film."""
-    sides = zip(*(frames(film, policy, console) for policy in ("uncompensated", film.compensated)), strict=True)
+    sides = zip(
+        *(frames(film, policy, console) for policy in ("uncompensated", film.compensated)),
+        strict=True,
+    )
     first, *others = (PIL.Image.fromarray(np.concatenate(pair, axis=1)) for pair in sides)
     first.save(
         path,
@@ -102,7 +116,8 @@ def write(film: Film, path: Path, console: Console) -> Path:
 
 def main(arguments: Sequence[str]) -> None:
     """Write the films: [CHECKOUT], by default the working directory."""
-    console, images = Console(), Path(*arguments) / "docs" / "images"
+    console = Console()
+    images = Path(*arguments) / "docs" / "images"
     for name, film in films().items():
         console.print(f"wrote {write(film, images / f'{name}.webp', console)}", soft_wrap=True)
 

@@ -2,7 +2,8 @@
 
     python -m docs.pages.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
 
-Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of the robot.
+Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of
+the robot.
 """
 
 import csv
@@ -36,7 +37,8 @@ from elastic_env.robots.gallery import (  # noqa: E402
 _SOFT = 0.7
 """True stiffness over the assumed one in the scenario `soft`."""
 _SEED = 7
-_PIXELS, _COLOURS = 340, 64
+_PIXELS = 340
+_COLOURS = 64
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,16 @@ class AtRest:
     def links(self, theta: Array, softer: float = 1.0) -> Array:
         """Where the links are for angles of the servos, (..., n) [rad]; `softer` is true over assumed stiffness."""
         return static_link_angle(
-            theta, softer * self.stiffness, self._torque.gravity_torque, self._torque.gravity_gradient
+            theta,
+            softer * self.stiffness,
+            self._torque.gravity_torque,
+            self._torque.gravity_gradient,
         )
 
     def end_effector(self, q: Array) -> Array:
         """Place of the end effector, from (m, n) [rad] to (m, 3) [m]."""
-        data, robot = mujoco.MjData(self.model), GALLERY[self.name]
+        data = mujoco.MjData(self.model)
+        robot = GALLERY[self.name]
         body = data.body(robot.end_effector)
         places = []
         for pose in q:
@@ -115,22 +121,27 @@ def measure(name: str, folder: Path | None = None) -> Sag:
     """How far a robot sags; arguments as of `AtRest`."""
     robot = AtRest(name, folder)
     q_ref = random_poses(robot.model, np.random.default_rng(_SEED))
-    commands, wanted = robot.commands(q_ref), robot.end_effector(q_ref)
+    commands = robot.commands(q_ref)
+    wanted = robot.end_effector(q_ref)
 
     def deviation(theta: Array, softer: float) -> Array:
         return np.linalg.norm(robot.end_effector(robot.links(theta, softer)) - wanted, axis=-1)
 
     without = deviation(q_ref, 1.0)
     return Sag(
-        robot=name, title=GALLERY[name].title, joints=len(robot.hinges),
+        robot=name,
+        title=GALLERY[name].title,
+        joints=len(robot.hinges),
         stiffness_least_Nm_per_rad=float(robot.stiffness.min()),
         stiffness_most_Nm_per_rad=float(robot.stiffness.max()),
         stiffness_source="assumed",
         deflection_peak_rad=float(np.abs(robot.links(q_ref) - q_ref).max()),
-        uncompensated_rms_m=_rms(without), uncompensated_peak_m=float(without.max()),
+        uncompensated_rms_m=_rms(without),
+        uncompensated_peak_m=float(without.max()),
         input_rms_m=_rms(deviation(commands, 1.0)),
-        soft_uncompensated_rms_m=_rms(deviation(q_ref, _SOFT)), soft_input_rms_m=_rms(deviation(commands, _SOFT)),
-    )  # fmt: skip
+        soft_uncompensated_rms_m=_rms(deviation(q_ref, _SOFT)),
+        soft_input_rms_m=_rms(deviation(commands, _SOFT)),
+    )
 
 
 def _rms(values: Array) -> float:

@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from docs.pages.cells import Cells, Rows, failed, minus, scaled
-from train.runs.escaping import markdown_table
+from docs.pages.cells import Cells, Rows, failed, minus, page_table, scaled
 
 ERROR = "link_error_rms_rad"
 _AT_REST = ("link_error_imu_min_rad", "link_error_imu_max_rad")
@@ -12,18 +11,20 @@ _NOT_PLAYED = "–"
 _RIVALS = ("input", "dynamic", "friction", "disturbance_observer")
 
 
-def _figures(count: int) -> list[str]:
-    return ["---:"] * count
-
-
 def paper_testbed(rows: Rows, identified: Rows) -> str:
     """Figs. 5 and 6 of the paper, beside the paper's figures."""
     cells = Cells(rows)
     (nominal,) = (row for row in identified if row["scenario"] == "nominal" and int(row["seeds"]) > 1)
-    lines = [[f"Pearson r, median of {nominal['seeds']} seeds", f"{float(nominal['pearson_r']):.4f}", _PAPER["r"]]]
+    lines = [
+        [
+            f"Pearson r, median of {nominal['seeds']} seeds",
+            f"{float(nominal['pearson_r']):.4f}",
+            _PAPER["r"],
+        ]
+    ]
     for policy in ("uncompensated", "input"):
         lines.append([f"link error at rest, `{policy}`", f"{_range(cells, policy)} mrad", _PAPER[policy]])
-    return markdown_table(["figure", "here", "paper"], ["---", *_figures(2)], lines) + "\n"
+    return page_table(["figure", "here", "paper"], lines)
 
 
 def _range(cells: Cells, policy: str) -> str:
@@ -37,16 +38,27 @@ def identification(rows: Rows) -> str:
     for row in rows:
         if _is_of_damping(row):
             continue
-        seeds, low, high = int(row["seeds"]), float(row["identified_min"]), float(row["identified_max"])
+        seeds = int(row["seeds"])
+        low = float(row["identified_min"])
+        high = float(row["identified_max"])
         found = f"{float(row['identified_median']):.1f}" + (f" ({low:.1f} to {high:.1f})" if seeds > 1 else "")
         scenario = f"`{row['scenario']}`, {seeds} seeds" if seeds > 1 else f"`{row['scenario']}`"
-        line, friction = f"{float(row['line_stiffness_nm_per_rad']):.1f}", f"{float(row['friction_nm']):.2f}"
-        truth, band = f"{float(row['stiffness_nm_per_rad']):g}", f"{1e3 * float(row['dead_band_rad']):.2f}"
+        line = f"{float(row['line_stiffness_nm_per_rad']):.1f}"
+        friction = f"{float(row['friction_nm']):.2f}"
+        truth = f"{float(row['stiffness_nm_per_rad']):g}"
+        band = f"{1e3 * float(row['dead_band_rad']):.2f}"
         lines.append([scenario, truth, found, line, friction, band])
-    head = ["scenario", "true K [N·m/rad]", "identified K", "plain line", "friction [N·m]", "dead band [mrad]"]
+    head = [
+        "scenario",
+        "true K [N·m/rad]",
+        "identified K",
+        "plain line",
+        "friction [N·m]",
+        "dead band [mrad]",
+    ]
     (nominal,) = (row for row in rows if row["scenario"] == "nominal" and not _is_of_damping(row))
     return (
-        f"{markdown_table(head, ['---', *_figures(5)], lines)}\n\n"
+        f"{page_table(head, lines)}\n"
         f"In `nominal` the 95 % interval holds the true K in {nominal['covered']} of {nominal['seeds']} seeds. Its "
         f"half-width is at most {100 * float(nominal['half_width_most']):.2f} %.\n"
     )
@@ -66,29 +78,48 @@ def output_compensators(rows: Rows) -> str:
         ]
         for row in rows
     ]
-    head = ["K [N·m/rad]", "largest deflection [mrad]", "error of Eq. 12 against Newton, rms [mrad]", "largest [mrad]"]
-    return markdown_table(head, _figures(4), lines) + "\n"
+    head = [
+        "K [N·m/rad]",
+        "largest deflection [mrad]",
+        "error of Eq. 12 against Newton, rms [mrad]",
+        "largest [mrad]",
+    ]
+    return page_table(head, lines, words=0)
 
 
 def damping(rows: Rows, identified: Rows) -> str:
     """What the damping of the transmission changes: the identification, the errors at rest and those in motion."""
-    cells, lines = Cells(rows), []
+    cells = Cells(rows)
+    lines = []
     for row in identified:
         if not _is_of_damping(row):
             continue
         d = f"{float(row['damping_nms_per_rad']):g}"
-        motion = (scaled(cells.row(f"{policy}: {d}", "sine", "nominal"), ERROR)
-                  for policy in ("uncompensated", "input", "dynamic", "oracle"))  # fmt: skip
+        motion = (
+            scaled(cells.row(f"{policy}: {d}", "sine", "nominal"), ERROR)
+            for policy in ("uncompensated", "input", "dynamic", "oracle")
+        )
         lines.append(
-            [d, f"{float(row['identified_median']):.1f}", f"{float(row['friction_nm']):.2f}",
-             f"{float(row['pearson_r']):.3f}", _range(cells, f"uncompensated: {d}"), _range(cells, f"input: {d}"),
-             ", ".join(f"{value:.1f}" for value in motion)]
-        )  # fmt: skip
+            [
+                d,
+                f"{float(row['identified_median']):.1f}",
+                f"{float(row['friction_nm']):.2f}",
+                f"{float(row['pearson_r']):.3f}",
+                _range(cells, f"uncompensated: {d}"),
+                _range(cells, f"input: {d}"),
+                ", ".join(f"{value:.1f}" for value in motion),
+            ]
+        )
     head = [
-        "D [N·m·s/rad]", "identified K", "friction [N·m]", "r", "error at rest, uncompensated [mrad]", "`input` [mrad]",
+        "D [N·m·s/rad]",
+        "identified K",
+        "friction [N·m]",
+        "r",
+        "error at rest, uncompensated [mrad]",
+        "`input` [mrad]",
         "sine rms: uncompensated, input, dynamic, oracle [mrad]",
-    ]  # fmt: skip
-    return markdown_table(head, _figures(7), lines) + "\n"
+    ]
+    return page_table(head, lines, words=0)
 
 
 def scenarios(rows: Rows) -> str:
@@ -109,7 +140,7 @@ def _link_errors(cells: Cells, policies: Sequence[str]) -> str:
             if any(figure != _NOT_PLAYED for figure in own):
                 lines.append([reference, f"`{scenario}`", *own])
     head = ["reference", "scenario", *(f"`{policy}`" for policy in policies)]
-    return markdown_table(head, ["---"] * 2 + _figures(len(policies)), lines) + "\n"
+    return page_table(head, lines, words=2)
 
 
 def _rms(cells: Cells, policy: str, reference: str, scenario: str) -> str:

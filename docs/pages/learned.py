@@ -5,17 +5,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from docs.pages.cells import Rows
+from docs.pages.cells import Rows, page_table
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.changes import BEST_ANALYTIC, FEWEST_SEEDS, percent, percent_interval, signed_off
-from train.evaluate.evaluate import grouped
+from train.evaluate.changes import (
+    BEST_ANALYTIC,
+    FEWEST_SEEDS,
+    percent,
+    percent_interval,
+    signed_off,
+)
+from train.evaluate.episodes import group_by
 from train.evaluate.statistics import Estimate
-from train.runs.escaping import markdown_table
 
 _METRICS = {
-    "pelvis_error_rms_rad": ("pelvis error", "mrad"), "zmp_deviation_rms_m": ("ZMP deviation", "mm"),
-    "link_error_rms_rad": ("link error", "mrad"), "end_effector_error_rms_m": ("end effector error", "mm"),
-}  # fmt: skip
+    "pelvis_error_rms_rad": ("pelvis error", "mrad"),
+    "zmp_deviation_rms_m": ("ZMP deviation", "mm"),
+    "link_error_rms_rad": ("link error", "mrad"),
+    "end_effector_error_rms_m": ("end effector error", "mm"),
+}
 """Metrics that pages show, with the unit of their tables."""
 _JUDGED = ("pelvis_error_rms_rad", "zmp_deviation_rms_m", "link_error_rms_rad")
 ARM = ("end_effector_error_rms_m", "link_error_rms_rad")
@@ -56,17 +63,21 @@ class LearnedMap:
         """From the rows of one map, metric and residual."""
         first = rows[0]
         return cls(
-            first["policy"], first["metric"], first["x_is"], first["y_is"],
-            list(dict.fromkeys(row["x"] for row in rows)), list(dict.fromkeys(row["y"] for row in rows)),
+            first["policy"],
+            first["metric"],
+            first["x_is"],
+            first["y_is"],
+            list(dict.fromkeys(row["x"] for row in rows)),
+            list(dict.fromkeys(row["y"] for row in rows)),
             {(row["x"], row["y"]): row for row in rows},
-        )  # fmt: skip
+        )
 
     @property
     def table(self) -> str:
         """Changes with x to the right and y upwards."""
         head = [f"{self.y_is} \\ {self.x_is}", *self.x]
         rows = [[f"**{y}**", *(_change(self.cells[x, y]) for x in self.x)] for y in reversed(self.y)]
-        return markdown_table(head, ["---:"] * len(head), rows)
+        return page_table(head, rows, words=0)
 
     @property
     def sentence(self) -> str:
@@ -102,7 +113,7 @@ def learned_maps(path: Path) -> list[LearnedMap]:
 
 def maps_markdown(maps: Iterable[LearnedMap]) -> str:
     """A sentence and a table for each map."""
-    return "\n".join(f"{each.sentence}\n\n{each.table}\n" for each in maps)
+    return "\n".join(f"{each.sentence}\n\n{each.table}" for each in maps)
 
 
 def changes_table(
@@ -121,13 +132,16 @@ def changes_table(
     titles = {metric: _METRICS[metric] for metric in metrics if any(row["metric"] == metric for row in own)}
     names = [name for name in ("policy", "reference") if len({row[name] for row in own}) > 1]
     lines = []
-    for place, found in grouped(own, lambda row: (*(row[name] for name in names), row["scope"])).items():
+    for place, found in group_by(own, lambda row: (*(row[name] for name in names), row["scope"])).items():
         by_metric = {row["metric"]: row for row in found}
         cells = (part for metric, (_, unit) in titles.items() for part in _over_base(by_metric[metric], unit))
         lines.append([*place[:-1], _scope(found[0]), *cells])
-    head = [*names, "", *(text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change"))]
-    rules = ["---"] * (len(names) + 1) + ["---:"] * (2 * len(titles))
-    return markdown_table(head, rules, lines) + "\n"
+    head = [
+        *names,
+        "",
+        *(text for title, unit in titles.values() for text in (f"base: {title} [{unit}]", "change")),
+    ]
+    return page_table(head, lines, words=len(names) + 1)
 
 
 def beyond_the_best(*tables: Rows) -> str:
@@ -145,14 +159,19 @@ def learning_in_short(*tables: Rows) -> str:
     Args:
         tables: Rows of a `statistics.csv` each; the motion that comes first counts.
     """
-    metrics, lines = _JUDGED[:2], []
+    metrics = _JUDGED[:2]
+    lines = []
     for rows in tables:
         own = [row for row in rows if row["base_is"] == _BASE and row["reference"] == rows[0]["reference"]]
         cells = {(row["scope"], row["metric"]): row for row in own if row["pooled"] == "True"}
         changes = [_over_base(cells[scope, metric], "")[1] for metric in metrics for scope in _SHORT]
         lines.append([own[0]["reference"], f"`{own[0]['base']}`", *changes])
-    head = ["step", "base", *(f"{_METRICS[metric][0]}, {scope}" for metric in metrics for scope in _SHORT)]
-    return markdown_table(head, ["---"] * 2 + ["---:"] * 4, lines) + "\n"
+    head = [
+        "step",
+        "base",
+        *(f"{_METRICS[metric][0]}, {scope}" for metric in metrics for scope in _SHORT),
+    ]
+    return page_table(head, lines, words=2)
 
 
 def _scope(row: Mapping[str, str]) -> str:

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-from docs.pages.cells import Rows
-from train.evaluate.evaluate import grouped
-from train.evaluate.leaderboard import Standing
-from train.runs.escaping import markdown_table
+from docs.pages.cells import Rows, page_table
+from train.evaluate.episodes import group_by
+from train.evaluate.standings import Standing
 
-_RAW, _OURS = "raw mj_step", "vector env"
+_RAW = "raw mj_step"
+_OURS = "vector env"
 
 
 def vector_environments(*tables: Rows) -> str:
@@ -15,13 +15,20 @@ def vector_environments(*tables: Rows) -> str:
     lines = []
     rows = [row for table in tables for row in table if row["against"] == f"{_RAW}, {row['num_envs']}"]
     rows = sorted(rows, key=lambda row: int(row["num_envs"]))
-    for (env, worlds), own in sorted(grouped(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot):
+    for (env, worlds), own in sorted(group_by(rows, lambda row: (row["env"], row["num_envs"])).items(), key=_robot):
         ratios = [f"{float(row['ratio']):.2f}" for row in own if row["contender"].startswith(_OURS)]
         (raw, *_) = (row for row in own if row["contender"] == _RAW)
         if ratios:  # the scalar environment has raw physics of its own
             lines.append([env, worlds, f"{1e6 / float(raw['steps_per_s']):.0f}", *ratios])
-    head = ["", "worlds", "raw [µs]", "environment / raw", "with policy / raw", "with policy and network / raw"]
-    return markdown_table(head, ["---", *["---:"] * 5], lines) + "\n"
+    head = [
+        "",
+        "worlds",
+        "raw [µs]",
+        "environment / raw",
+        "with policy / raw",
+        "with policy and network / raw",
+    ]
+    return page_table(head, lines)
 
 
 def _robot(place: tuple[tuple[str, ...], Rows]) -> str:
@@ -42,8 +49,14 @@ def other_ways(*tables: Rows) -> str:
         for row in rows
     ]
     against = sorted({row["against"] for row in rows if not row["contender"].startswith("PPO")})
-    head = ["", "", "worlds", "control steps/s", f"ratio to {' and '.join(against)}; of PPO to the first of them"]
-    return markdown_table(head, ["---", "---", *["---:"] * 3], lines) + "\n"
+    head = [
+        "",
+        "",
+        "worlds",
+        "control steps/s",
+        f"ratio to {' and '.join(against)}; of PPO to the first of them",
+    ]
+    return page_table(head, lines, words=2)
 
 
 def costs_of_cells(rows: Rows) -> str:
@@ -57,11 +70,11 @@ def costs_of_cells(rows: Rows) -> str:
         else:
             again = f"at most {row['played_again_most']} cells began again"
             lines.append([what, "–", f"{row['identical']} complete and identical; {again}", "–"])
-    return markdown_table(["trial", "on this machine", "on dask", "dask / local"], ["---", *["---:"] * 3], lines) + "\n"
+    return page_table(["trial", "on this machine", "on dask", "dask / local"], lines)
 
 
 def policies_alone(standings: Sequence[Standing]) -> str:
     """What `predict` takes for one world of the walker, as it was measured with the leaderboard."""
     took = sorted({s.policy: s.step_us for s in standings}.items(), key=lambda own: own[1])
     lines = [[policy, f"{step_us:.0f}"] for policy, step_us in took]
-    return markdown_table(["policy", "`predict` [µs]"], ["---", "---:"], lines) + "\n"
+    return page_table(["policy", "`predict` [µs]"], lines)

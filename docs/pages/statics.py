@@ -1,6 +1,7 @@
 """Tables of the docs that no comparison plays: identifications, Eq. 12 against Eq. 10, and gravity torques of a stance.
 
-`python -m docs.pages.statics [CHECKOUT]` writes them into docs/results of a checkout, in some minutes.
+`python -m docs.pages.statics [CHECKOUT]` writes them into docs/results of a checkout, in some
+minutes.
 """
 
 import sys
@@ -32,7 +33,8 @@ IDENTIFIED: Sequence[dict[str, Any]] = (
 )
 """Joints that are identified: scenario, true K, damping, seeds of the sensor noise."""
 _JOINTS = ("hip_roll", "ankle_roll", "knee")
-_LIFT_M, _INWARD_M = 0.05, 0.02
+_LIFT_M = 0.05
+_INWARD_M = 0.02
 
 
 def identification(
@@ -40,14 +42,24 @@ def identification(
 ) -> dict[str, Any]:
     """The static experiment with some seeds of the sensor noise, as a row of `identification.csv`."""
     env = gymnasium.make_vec(
-        "elastic_env/Testbed-v0", num_envs=seeds, vectorization_mode=_MODULE, reference="hold", scenario=scenario,
-        stiffness=stiffness, joint={"damping": damping},
-    )  # fmt: skip
+        "elastic_env/Testbed-v0",
+        num_envs=seeds,
+        vectorization_mode=_MODULE,
+        reference="hold",
+        scenario=scenario,
+        stiffness=stiffness,
+        joint={"damping": damping},
+    )
     try:
         found, _ = identify([env], 0)
     finally:
         env.close()
-    place = {"scenario": scenario, "stiffness_nm_per_rad": stiffness, "damping_nms_per_rad": damping, "seeds": seeds}
+    place = {
+        "scenario": scenario,
+        "stiffness_nm_per_rad": stiffness,
+        "damping_nms_per_rad": damping,
+        "seeds": seeds,
+    }
     return {**place, **_spread(found, stiffness)}
 
 
@@ -58,11 +70,13 @@ def _spread(found: Sequence[Identification], truth: float) -> dict[str, Any]:
         for name in ("line_stiffness_nm_per_rad", "friction_nm", "dead_band_rad", "pearson_r")
     }
     return {
-        "identified_median": float(np.median(stiffness)), "identified_min": float(stiffness.min()),
-        "identified_max": float(stiffness.max()), **medians,
+        "identified_median": float(np.median(stiffness)),
+        "identified_min": float(stiffness.min()),
+        "identified_max": float(stiffness.max()),
+        **medians,
         "covered": sum(e.stiffness_low_nm_per_rad <= truth <= e.stiffness_high_nm_per_rad for e in found),
         "half_width_most": max(each.half_width for each in found),
-    }  # fmt: skip
+    }
 
 
 def output_compensators() -> Iterator[dict[str, Any]]:
@@ -76,14 +90,17 @@ def output_compensators() -> Iterator[dict[str, Any]]:
         K = np.array([stiffness])
         deflection = gravity.gravity_torque(q) / K
         theta = q + deflection
-        newton, taylor = newton_link_angle(theta, K, gravity), taylor_link_angle(theta, K, gravity)
+        newton = newton_link_angle(theta, K, gravity)
+        taylor = taylor_link_angle(theta, K, gravity)
         error = np.abs(taylor - newton)
         residual = np.abs(theta - newton - gravity.gravity_torque(newton) / K)
         yield {
-            "stiffness_nm_per_rad": stiffness, "deflection_peak_rad": float(np.abs(deflection).max()),
-            "error_rms_rad": float(np.sqrt(np.mean(error**2))), "error_peak_rad": float(error.max()),
+            "stiffness_nm_per_rad": stiffness,
+            "deflection_peak_rad": float(np.abs(deflection).max()),
+            "error_rms_rad": float(np.sqrt(np.mean(error**2))),
+            "error_peak_rad": float(error.max()),
             "newton_residual_rad": float(residual.max()),
-        }  # fmt: skip
+        }
     env.close()
 
 
@@ -107,7 +124,8 @@ def _stance(model: WalkerModel, zmp: Array) -> Array:
     """Joint angles of the posture of Fig. 1 with the center of mass over the ZMP, (12,) [rad]."""
     biped = model.biped
     ankles = np.column_stack([biped.footholds, ANKLE_HEIGHT_M + np.array([0.0, _LIFT_M])])
-    body, pelvis = FloatingBody(biped.rigid, LEG_JOINTS), np.array([*zmp, Gait().hip_height_m])
+    body = FloatingBody(biped.rigid, LEG_JOINTS)
+    pelvis = np.array([*zmp, Gait().hip_height_m])
     for _ in range(60):
         center = body.center_of_mass(biped.joint_angles(pelvis, ankles)[None])[0]
         pelvis[:2] += zmp - pelvis[:2] - center[:2]

@@ -14,11 +14,13 @@ from rich.console import Console
 
 from docs.pages.step_picture import CHARTS, WITH, WITHOUT
 from train.evaluate.conditions import Condition, PolicySpec
-from train.evaluate.evaluate import make_policy
+from train.evaluate.rollout import make_policy
 from train.experiments.play import episode
 from train.runs.escaping import write_records
 
-BEGIN_S, END_S, EVERY = 4.0, 7.0, 5
+BEGIN_S = 4.0
+END_S = 7.0
+EVERY = 5
 """The second step, and every how many control steps a row is written."""
 
 
@@ -28,7 +30,8 @@ def rows(console: Console) -> list[dict[str, Any]]:
     for policy in (WITHOUT, WITH):
         condition = Condition(env="walker", policy=PolicySpec(name=policy), reference=3)
         env: Any = gymnasium.make(condition.environment.id, **condition.arguments)
-        period, share = env.unwrapped.task.assumed_model.control_period_s, env.unwrapped.task.plan.share
+        period = env.unwrapped.task.assumed_model.control_period_s
+        share = env.unwrapped.task.plan.share
         for step, info in episode(env, make_policy(condition.policy, env), condition, round(END_S / period), console):
             time_s = (step + 1) * period
             if time_s >= BEGIN_S and (step + 1) % EVERY == 0:

@@ -9,11 +9,17 @@ from dataclasses import dataclass
 
 Rows = Sequence[Mapping[str, str]]
 
-WITHOUT, WITH = "uncompensated", "input_output"
+WITHOUT = "uncompensated"
+WITH = "input_output"
 """The policies of the two curves."""
 _TITLES = {WITHOUT: "without", WITH: "with compensation"}
 _COLOURS = {WITHOUT: "#d05a3f", WITH: "#1a9a86"}
-_WIDTH, _LEFT, _RIGHT, _TOP, _HEIGHT, _GAP = 420, 44, 408, 34, 124, 56
+_WIDTH = 420
+_LEFT = 44
+_RIGHT = 408
+_TOP = 34
+_HEIGHT = 124
+_GAP = 56
 _HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}"
 role="img" aria-label="{label}">
 <style>
@@ -48,8 +54,8 @@ CHARTS = (
 def step_svg(rows: Rows) -> str:
     """The picture.
 
-    Args:
-        rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals of the charts.
+    Args: rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals
+        of the charts.
     """
     height = _TOP + len(CHARTS) * (_HEIGHT + _GAP)
     label = "Pelvis error and ZMP deviation over a step of 3 s, without and with compensation"
@@ -71,7 +77,8 @@ def _drawn(chart: Chart, rows: Rows, top: float) -> list[str]:
         return bottom - _HEIGHT * value / chart.ticks[-1]
 
     alone = [time for time, row in zip(times, rows, strict=True) if row["single_support"] == "1"]
-    begin, end = x(alone[0]), x(alone[-1])
+    begin = x(alone[0])
+    end = x(alone[-1])
     parts = [
         f'<rect class="support" x="{begin:.1f}" y="{top}" width="{end - begin:.1f}" height="{_HEIGHT}"/>',
         f'<text x="{_LEFT}" y="{top - 10}" class="title">{chart.title}</text>',

@@ -2,24 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 
-from docs.pages.cells import Cells, Rows, failed, minus, scaled, shown
-from train.evaluate.leaderboard import Standing
-from train.runs.escaping import markdown_table
+from docs.pages.cells import Cells, Rows, failed, minus, page_table, scaled, shown
+from train.evaluate.standings import Standing
 
-PELVIS, ZMP = "pelvis_error_rms_rad", "zmp_deviation_rms_m"
+PELVIS = "pelvis_error_rms_rad"
+ZMP = "zmp_deviation_rms_m"
 
 _ROLL, _PITCH = (tuple(f"pelvis_{axis}_{kind}_rad" for kind in ("rms", "peak")) for axis in ("roll", "pitch"))
 _ZMPS = (ZMP, "zmp_deviation_x_rms_m", "zmp_deviation_y_rms_m")
-_EARLY, _FRAME, _JUMP = "early_touchdown_mean_s", "frame_error_mean_m", "com_jump_mean_m"
+_EARLY = "early_touchdown_mean_s"
+_FRAME = "frame_error_mean_m"
+_JUMP = "com_jump_mean_m"
 _LARGE = 19.95
 """From here on a figure has no decimal."""
 _NEVER_SHOWN = ("zero", "uncompensated_open")
 _FAST = ("uncompensated", "input_output", "input_wrench", "dynamic", "oracle")
-_PUBLISHED, _MIXTURE = ("uncompensated", "talos", "thormang"), ("nominal", "soft", "spread", "payload", "sensor")
-
-
-def _figures(count: int) -> list[str]:
-    return ["---:"] * count
+_PUBLISHED = ("uncompensated", "talos", "thormang")
+_MIXTURE = ("nominal", "soft", "spread", "payload", "sensor")
 
 
 def all_scenarios(rows: Rows) -> str:
@@ -29,12 +28,15 @@ def all_scenarios(rows: Rows) -> str:
     tables = []
     for reference in cells.names("reference"):
         lines = [
-            [f"`{scenario}`", *(_walk(cells.row(policy, reference, scenario)) for policy in policies)]
+            [
+                f"`{scenario}`",
+                *(_walk(cells.row(policy, reference, scenario)) for policy in policies),
+            ]
             for scenario in cells.names("scenario")
         ]
         head = [reference, *(f"`{policy}`" for policy in policies)]
-        tables.append(markdown_table(head, ["---", *_figures(len(policies))], lines))
-    return "\n\n".join(tables) + "\n"
+        tables.append(page_table(head, lines))
+    return "\n".join(tables)
 
 
 def _walk(row: Mapping[str, str]) -> str:
@@ -47,19 +49,27 @@ def _walk(row: Mapping[str, str]) -> str:
 
 def paper_walks(rows: Rows, others: Rows) -> str:
     """Roll, pitch, ZMP deviation and early touch-down of every baseline in the gaits of the paper and faster."""
-    cells, fast = Cells(rows), Cells(others)
+    cells = Cells(rows)
+    fast = Cells(others)
     places = [
-        (cells, policy, reference, scenario) for reference in cells.names("reference")
-        for scenario in cells.names("scenario") for policy in cells.names("policy")
+        (cells, policy, reference, scenario)
+        for reference in cells.names("reference")
+        for scenario in cells.names("scenario")
+        for policy in cells.names("policy")
         if cells.has(policy, reference, scenario)
-    ]  # fmt: skip
+    ]
     places += [(fast, policy, reference, "ideal") for reference in ("1.6 s", "1.1 s") for policy in _FAST]
     lines = [
-        [reference, f"`{scenario}`", _robot(policy), *_paper_walk(own.row(policy, reference, scenario))]
+        [
+            reference,
+            f"`{scenario}`",
+            _robot(policy),
+            *_paper_walk(own.row(policy, reference, scenario)),
+        ]
         for own, policy, reference, scenario in places
     ]
     head = ["step", "scenario", "policy", "roll", "pitch", "ZMP", "early"]
-    return markdown_table(head, ["---"] * 3 + _figures(4), lines) + "\n"
+    return page_table(head, lines, words=3)
 
 
 def _robot(policy: str) -> str:
@@ -76,14 +86,15 @@ def _paper_walk(row: Mapping[str, str]) -> list[str]:
 
 def local_frame(rows: Rows) -> str:
     """Error of the local frame, and jump of the estimated center of mass, at the support changes."""
-    cells, lines = Cells(rows), []
+    cells = Cells(rows)
+    lines = []
     references = cells.names("reference")
     for policy in cells.names("policy"):
         found = [cells.row(policy, reference, "nominal") for reference in references]
         if all(row[_FRAME] for row in found) and not policy.endswith("_open"):
             lines.append([f"`{policy}`", *(shown(row, [m], 1) for m in (_FRAME, _JUMP) for row in found)])
     head = ["", *(f"{what}, {reference}" for what in ("e", "jump") for reference in references)]
-    return markdown_table(head, ["---", *_figures(len(head) - 1)], lines) + "\n"
+    return page_table(head, lines)
 
 
 def sensitivity(rows: Rows) -> str:
@@ -98,7 +109,7 @@ def sensitivity(rows: Rows) -> str:
         places = [(f"{policy}: {change}", "3 s", scenario) for policy, scenario in columns]
         lines.append([change, *(_sway(cells.row(*place)) if cells.has(*place) else "–" for place in places)])
     head = ["", *(f"`{policy}`, `{scenario}`" for policy, scenario in columns)]
-    return markdown_table(head, ["---", *_figures(4)], lines) + "\n"
+    return page_table(head, lines)
 
 
 def _sway(row: Mapping[str, str]) -> str:
@@ -112,9 +123,10 @@ def _sway(row: Mapping[str, str]) -> str:
 def gravity_torques(rows: Rows) -> str:
     """Gravity torque of the stance leg by each reading of Eq. 4."""
     meaning = {
-        "com": "contact at the ZMP, all links weigh", "ankle": "contact at the ankle axis",
+        "com": "contact at the ZMP, all links weigh",
+        "ankle": "contact at the ankle axis",
         "lumped": "and the legs weigh nothing, as in published code",
-    }  # fmt: skip
+    }
     joints = ("hip_roll", "ankle_roll", "knee")
     lines = []
     for row in rows:
@@ -122,7 +134,7 @@ def gravity_torques(rows: Rows) -> str:
         torques = (" / ".join(minus(f"{torque:.1f}").replace("−0.0", "0.0") for torque in leg) for leg in own)
         lines.append([f"`{row['method']}`: {meaning[row['method']]}", *torques])
     head = ["", "ZMP under the ankle: hip roll / ankle roll / knee", "ZMP 0.02 m inward"]
-    return markdown_table(head, ["---", *_figures(2)], lines) + "\n"
+    return page_table(head, lines)
 
 
 def drawn_robots(rows: Rows) -> str:
@@ -131,13 +143,22 @@ def drawn_robots(rows: Rows) -> str:
     for row in rows:
         found.setdefault((row["scenario"], row["policy"]), {})[row["metric"]] = row
     lines = [
-        [f"`{scenario}`", policy if " " in policy else f"`{policy}`",
-         *(" / ".join(f"{1e3 * float(own[metric][name]):.1f}" for name in ("mean", "interquartile_mean", "worst_tenth"))
-           for metric in (PELVIS, ZMP)), own[PELVIS]["failed"], own[PELVIS]["episodes"]]
+        [
+            f"`{scenario}`",
+            policy if " " in policy else f"`{policy}`",
+            *(
+                " / ".join(
+                    f"{1e3 * float(own[metric][name]):.1f}" for name in ("mean", "interquartile_mean", "worst_tenth")
+                )
+                for metric in (PELVIS, ZMP)
+            ),
+            own[PELVIS]["failed"],
+            own[PELVIS]["episodes"],
+        ]
         for (scenario, policy), own in sorted(found.items(), key=lambda item: item[0][0])
-    ]  # fmt: skip
+    ]
     head = ["scenario", "policy", "pelvis error", "ZMP deviation", "falls", "robots"]
-    return markdown_table(head, ["---"] * 2 + _figures(4), lines) + "\n"
+    return page_table(head, lines, words=2)
 
 
 def imu_errors(rows: Rows) -> str:
@@ -147,20 +168,29 @@ def imu_errors(rows: Rows) -> str:
     lines = []
     for policy in cells.names("policy"):
         own = [cells.row(policy, "3 s", scenario) for scenario in ("nominal", "imu")]
-        lines.append([f"`{policy}`", *(shown(row, metrics, 2) for row in own), str(sum(failed(row)[0] for row in own))])
+        lines.append(
+            [
+                f"`{policy}`",
+                *(shown(row, metrics, 2) for row in own),
+                str(sum(failed(row)[0] for row in own)),
+            ]
+        )
     head = ["policy", "`nominal`: pelvis / ZMP / IMU", "`imu`: pelvis / ZMP / IMU", "falls"]
-    return markdown_table(head, ["---", *_figures(3)], lines) + "\n"
+    return page_table(head, lines)
 
 
 def published_controllers(standings: Sequence[Standing]) -> str:
     """What two teams published for their robots, beside no compensation."""
     found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s"}
     lines = [
-        [f"`{policy}`", *(_mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)]) for scope in _MIXTURE)]
+        [
+            f"`{policy}`",
+            *(_mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)]) for scope in _MIXTURE),
+        ]
         for policy in _PUBLISHED
     ]
     head = ["policy", *(f"`{scope}`" for scope in _MIXTURE)]
-    return markdown_table(head, ["---", *_figures(len(_MIXTURE))], lines) + "\n"
+    return page_table(head, lines)
 
 
 def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
@@ -168,11 +198,16 @@ def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
     found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s" and not s.is_group}
     scopes = [scope for policy, scope, metric in found if (policy, metric) == ("iterative", PELVIS)]
     lines = [
-        [f"`{scope}`", *(_mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)], 2)
-                         for policy in ("adaptive_posture", "iterative"))]
+        [
+            f"`{scope}`",
+            *(
+                _mean([found[policy, scope, metric] for metric in (PELVIS, ZMP)], 2)
+                for policy in ("adaptive_posture", "iterative")
+            ),
+        ]
         for scope in scopes
-    ]  # fmt: skip
-    return markdown_table(["scenario", "without learning", "after ten walks"], ["---", *_figures(2)], lines) + "\n"
+    ]
+    return page_table(["scenario", "without learning", "after ten walks"], lines)
 
 
 def _mean(pair: Sequence[Standing], decimals: int = 1) -> str:

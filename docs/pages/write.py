@@ -2,9 +2,10 @@
 
     python -m docs.pages          # README.md and docs/*.md from docs/results
 
-A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. A figure
-within a sentence stands between `<!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->` and `<!-- / -->`.
-The tool writes all of them anew. A test fails where a page and the results disagree.
+A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard:
+end -->`. A figure within a sentence stands between `<!-- = paper; input_output; 3 s; nominal;
+pelvis_roll_rms_rad -->` and `<!-- / -->`. The tool writes all of them anew. A test fails where a
+page and the results disagree.
 """
 
 import re
@@ -14,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from docs.pages import arms, joints, speeds, walks
-from docs.pages.cells import KEPT, Cells, Rows, minus, read_rows, scaled
+from docs.pages.cells import KEPT, Cells, Rows, minus, page_table, read_rows, scaled
 from docs.pages.learned import (
     ARM,
     GROUPS,
@@ -28,13 +29,21 @@ from docs.pages.learned import (
 )
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
-from train.evaluate.leaderboard import Standing
+from train.evaluate.standings import Standing
 from train.experiments.demo import PAPER_PELVIS
 from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
-from train.runs.escaping import markdown_table
+from train.report.render import Head, Row, Table, render
 
 _TITLES = {"uncompensated": "without compensation", "input_output": "with the paper's compensator"}
-_SAGS = ("uncompensated_rms", "uncompensated_peak", "input_rms", "soft_uncompensated_rms", "soft_input_rms")
+_SAGS = (
+    "uncompensated_rms",
+    "uncompensated_peak",
+    "input_rms",
+    "soft_uncompensated_rms",
+    "soft_input_rms",
+)
+_WORDS = ("robot", "K [N·m/rad]", "source of K")
+"""Columns of the gallery that hold words."""
 _PEAKS = ("pelvis_roll_peak_rad", "pelvis_pitch_peak_rad")
 
 
@@ -114,7 +123,7 @@ def walks_beside_the_paper(walks: Rows) -> str:
             roll, pitch = (f"{1e3 * float(row[name]):.1f}" for name in _PEAKS)
             rows.append([row["reference"], _TITLES[row["policy"]], roll, pitch, PAPER_PELVIS[row["policy"]]])
     head = ["step period", "largest error of the pelvis [mrad]", "roll", "pitch", "paper"]
-    return markdown_table(head, ["---"] * 2 + ["---:"] * 3, rows) + "\n"
+    return page_table(head, rows, words=2)
 
 
 def gallery_table(gallery: Rows) -> str:
@@ -124,14 +133,29 @@ def gallery_table(gallery: Rows) -> str:
         least, most = (float(row[f"stiffness_{which}_Nm_per_rad"]) for which in ("least", "most"))
         deviations = [f"{1e3 * float(row[f'{name}_m']):.1f}" for name in _SAGS]
         rows.append(
-            [row["title"], row["joints"], f"{least:g} to {most:g}", row["stiffness_source"],
-             f"{1e3 * float(row['deflection_peak_rad']):.0f}", *deviations]
-        )  # fmt: skip
+            [
+                row["title"],
+                row["joints"],
+                f"{least:g} to {most:g}",
+                row["stiffness_source"],
+                f"{1e3 * float(row['deflection_peak_rad']):.0f}",
+                *deviations,
+            ]
+        )
     head = [
-        "robot", "joints", "K [N·m/rad]", "source of K", "largest deflection [mrad]", "sag [mm]", "largest sag",
-        "`input`", "sag, soft", "`input`, soft",
-    ]  # fmt: skip
-    return markdown_table(head, ["---", "---:", "---", "---", *["---:"] * 6], rows) + "\n"
+        "robot",
+        "joints",
+        "K [N·m/rad]",
+        "source of K",
+        "largest deflection [mrad]",
+        "sag [mm]",
+        "largest sag",
+        "`input`",
+        "sag, soft",
+        "`input`, soft",
+    ]
+    heads = tuple(Head(title, is_number=title not in _WORDS) for title in head)
+    return render(Table(heads, tuple(Row(tuple(row)) for row in rows)), "markdown") + "\n"
 
 
 def gallery_pictures(gallery: Rows) -> str:
@@ -166,7 +190,11 @@ PARTS: Mapping[str, Part] = {
     "leaderboard": _of_standings(leaderboard_markdown),
     "what learning adds": _of_standings(claims_markdown),
     "learning in short": _of(
-        learning_in_short, "learned_walker", "learned_posture", "learned_posture_1600ms", "learned_posture_1100ms"
+        learning_in_short,
+        "learned_walker",
+        "learned_posture",
+        "learned_posture_1600ms",
+        "learned_posture_1100ms",
     ),
     "published controllers": _of_standings(walks.published_controllers),
     "learned in ten walks": _of_standings(walks.learned_in_ten_walks),
@@ -215,10 +243,8 @@ _FIGURE = re.compile(r"<!-- = (.*?) -->(.*?)<!-- / -->")
 def figure(results: Results, place: str, now: str) -> str:
     """A figure within a sentence, with as many decimals as it has now.
 
-    Args:
-        results: The results.
-        place: Table, policy, reference, scenario, metric, and a statistic where it is not the first one.
-        now: The text between its marks.
+    Args: results: The results. place: Table, policy, reference, scenario, metric, and a statistic
+        where it is not the first one. now: The text between its marks.
 
     Raises:
         ConfigurationError: There is no such figure.
@@ -245,8 +271,8 @@ def has_parts(text: str) -> bool:
 def page_with(text: str, results: Results) -> str:
     """A page with every part and every figure between its marks written anew.
 
-    Raises:
-        ConfigurationError: It has no marks of any part, or not both of a part, each once and in order.
+    Raises: ConfigurationError: It has no marks of any part, or not both of a part, each once and in
+        order.
     """
     parts = [part for part in PARTS if any(mark in text for mark in marks(part))]
     for part in parts or ([] if _FIGURE.search(text) else PARTS):
@@ -276,7 +302,8 @@ def main(arguments: Sequence[str]) -> None:
     if len(arguments) > 1:
         raise SystemExit("usage: python -m docs.pages [CHECKOUT]")
     root = Path(*arguments)
-    found, results = pages(root), Results.read(root / "docs" / "results")
+    found = pages(root)
+    results = Results.read(root / "docs" / "results")
     for page in found:
         page.write_text(page_with(page.read_text(encoding="utf-8"), results), encoding="utf-8")
     for name, picture in PICTURES.items():

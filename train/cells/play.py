@@ -11,16 +11,8 @@ from elastic_env.core.errors import ElasticError
 from train.cells.key import cell_key
 from train.cells.store import Store, UnfitCellError
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import (
-    MOST_WORLDS,
-    Evaluation,
-    PolicyFailedError,
-    evaluate,
-    evaluate_together,
-    in_common,
-    num_steps,
-    plays_beside_others,
-)
+from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
+from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
 from train.runs.failures import DEFECT, explained
 from train.runs.progress import Show, plain_progress, show_progress
 from train.runs.warned import each_once, said_so_far
@@ -45,13 +37,17 @@ class CellsFailedError(ElasticError):
 
 
 def run_conditions(
-    conditions: Sequence[Condition], console: Console, place: Place = HERE, store: Store | None = None,
+    conditions: Sequence[Condition],
+    console: Console,
+    place: Place = HERE,
+    store: Store | None = None,
     fresh: bool = False,
-) -> list[Evaluation]:  # fmt: skip
+) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    The results do not depend on where they are played. On hardware the conditions come one after the other, in this
-    process, at whose terminal somebody can agree to them; nothing is kept of them.
+    The results do not depend on where they are played. On hardware the conditions come one after
+    the other, in this process, at whose terminal somebody can agree to them; nothing is kept of
+    them.
 
     Args:
         conditions: What to play.
@@ -104,15 +100,21 @@ class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
     def __init__(self, conditions: Sequence[Condition], console: Console, place: Place, store: Store | None) -> None:
-        self._conditions, self._console, self._place, self._store = conditions, console, place, store
+        self._conditions = conditions
+        self._console = console
+        self._place = place
+        self._store = store
         steps = num_steps(conditions)
         cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
         batches = [(batch, sum(steps[number] for number in batch)) for batch in in_batches(conditions, cores)]
         longest_first = sorted(batches, key=lambda batch: -batch[1])
-        self._batches, self._steps = [batch for batch, _ in longest_first], [steps for _, steps in longest_first]
+        self._batches = [batch for batch, _ in longest_first]
+        self._steps = [steps for _, steps in longest_first]
         self._keys = [] if store is None else [cell_key(condition) for condition in conditions]
         self._played = [0] * len(self._batches)
-        self._running, self._done, self._failed = set[int](), 0, 0
+        self._running = set[int]()
+        self._done = 0
+        self._failed = 0
         self._outcomes: list[Outcome | None] = [None] * len(conditions)
         self._show: Show = lambda *_: None
 
@@ -174,23 +176,28 @@ class _Playing:
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     """Conditions, by their numbers, that are played in one vector environment: many worlds cost less each.
 
-    Args:
-        conditions: What to play.
-        cores: Batches that are played at a time. There are twice as many, if there can be: not all last as long.
+    Args: conditions: What to play. cores: Batches that are played at a time. There are twice as
+        many, if there can be: not all last as long.
     """
     worlds = sum(condition.episodes for condition in conditions)
     most = min(worlds // (2 * cores), MOST_WORLDS)
     batches: list[list[int]] = []
     open_batch: dict[str, tuple[list[int], int]] = {}
     for number, condition in enumerate(conditions):
-        if not plays_beside_others(condition):
+        if not can_share_worlds(condition):
             batches.append([number])
             continue
-        policy = condition.policy, condition.member, condition.policy_options, condition.reference_name
-        key = repr((policy, in_common(condition)))
+        policy = (
+            condition.policy,
+            condition.member,
+            condition.policy_options,
+            condition.reference_name,
+        )
+        key = repr((policy, shared_settings(condition)))
         batch, size = open_batch.get(key, ([], most))
         if size + condition.episodes > most:
-            batch, size = [], 0
+            batch = []
+            size = 0
             batches.append(batch)
         batch.append(number)
         open_batch[key] = batch, size + condition.episodes
@@ -202,7 +209,10 @@ def _said(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     error = outcome.error
     assert error is not None
     found = explained(error)
-    said, code = found or (f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}", DEFECT)
+    said, code = found or (
+        f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}",
+        DEFECT,
+    )
     return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
 
 
@@ -215,7 +225,9 @@ def _name(condition: Condition) -> str:
 
 
 def _on_hardware(condition: Condition, which: str, console: Console) -> Evaluation:
-    (total,), done, say = num_steps([condition]), 0, plain_progress(console)
+    (total,) = num_steps([condition])
+    done = 0
+    say = plain_progress(console)
     console.print(f"{which}: {condition.policy.title} plays {condition.reference_name}", soft_wrap=True)
 
     def advance(steps: int) -> None:

@@ -1,6 +1,7 @@
 """Finished cells on the disk: a file each under the key of its content, written whole or not at all.
 
-A file holds its key and a digest of the rest, and is checked against the condition before anything of it is used.
+A file holds its key and a digest of the rest, and is checked against the condition before anything
+of it is used.
 """
 
 import dataclasses
@@ -20,12 +21,16 @@ from elastic_env.core.errors import ElasticError, shown
 from elastic_env.core.files import read_bounded, write_whole
 from train.cells.key import cell_key
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import Evaluation, words_of
+from train.evaluate.episodes import Evaluation, episode_labels
 
 CELLS = "cells"
 """Folder of a run in which its finished cells are."""
-_EPISODES, _TRACE, _POINTS, _REST = "episodes", "trace", "points", "rest_references"
-_KEY, _DIGEST = "key", "sha256"
+_EPISODES = "episodes"
+_TRACE = "trace"
+_POINTS = "points"
+_REST = "rest_references"
+_KEY = "key"
+_DIGEST = "sha256"
 _MOST_BYTES = 400_000_000
 """Bytes of a file, packed or not; a walk of two hours has less than half of it."""
 _EPISODE_BYTES = 20_000
@@ -74,8 +79,8 @@ class Store:
         Returns:
             Whether it is kept.
 
-        Raises:
-            OSError: The disk is full, or the folder cannot be written; cells that were kept before stay.
+        Raises: OSError: The disk is full, or the folder cannot be written; cells that were kept
+            before stay.
         """
         file = self._file(evaluation.condition)
         if key is not None and file.stem != key:
@@ -122,7 +127,8 @@ def _read(condition: Condition, key: str, content: bytes) -> Evaluation:
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         found = {name: arrays[name] for name in arrays.files}
     _require(_KEY in found and _DIGEST in found, "it has no key and digest, as those of an older version")
-    kept_for, digest = str(found.pop(_KEY)), str(found.pop(_DIGEST))
+    kept_for = str(found.pop(_KEY))
+    digest = str(found.pop(_DIGEST))
     _require(kept_for == key, "it is that of another cell")
     _require(digest == str(_digest(found)), "its content is not what was written")
     points = _part(found, _POINTS)
@@ -146,17 +152,23 @@ def _episodes(condition: Condition, text: npt.NDArray[Any]) -> list[dict[str, An
     most = _EPISODE_BYTES * condition.episodes
     _require(text.nbytes <= most, f"its episodes have {text.nbytes} bytes, at most {most} are read")
     episodes = json.loads(text.tobytes())
-    _require(isinstance(episodes, list) and all(isinstance(record, dict) for record in episodes), "it has no episodes")
+    _require(
+        isinstance(episodes, list) and all(isinstance(record, dict) for record in episodes),
+        "it has no episodes",
+    )
     count = len(episodes)
     _require(count == condition.episodes, f"it has {count} episodes, the cell has {condition.episodes}")
     for number, record in enumerate(episodes):
         _require_record(condition, number, record)
-        _require(record.keys() == episodes[0].keys(), f"episode {number} has other metrics than the first one")
+        _require(
+            record.keys() == episodes[0].keys(),
+            f"episode {number} has other metrics than the first one",
+        )
     return episodes
 
 
 def _require_record(condition: Condition, number: int, record: dict[str, Any]) -> None:
-    for name, value in words_of(condition, number).items():
+    for name, value in episode_labels(condition, number).items():
         own = record.get(name)
         same = type(own) is type(value) and own == value
         _require(same, f"{name} of episode {number} is {shown(own)}, in the cell it is {shown(value)}")
@@ -168,14 +180,20 @@ def _require_record(condition: Condition, number: int, record: dict[str, Any]) -
     for column in condition.environment.judged:
         value = record.get(column.metric)
         is_score = isinstance(value, float) and math.isfinite(value)
-        _require(is_score, f"{column.metric} of episode {number} must be a finite number, it is {shown(value)}")
+        _require(
+            is_score,
+            f"{column.metric} of episode {number} must be a finite number, it is {shown(value)}",
+        )
 
 
 def _require_arrays(evaluation: Evaluation) -> None:
     """Refuse time series and static points that are none of the condition's."""
     trace = evaluation.trace
     traced = list(evaluation.condition.environment.traced)
-    _require(list(trace) == traced, f"it has the signals {shown(list(trace))}, the cell has {shown(traced)}")
+    _require(
+        list(trace) == traced,
+        f"it has the signals {shown(list(trace))}, the cell has {shown(traced)}",
+    )
     for name, values in {**trace, "rest_references": evaluation.rest_references}.items():
         _require(values.ndim == 1 and values.dtype.kind == "f", f"{name} is no series of numbers")
         _require(not np.isinf(values).any(), f"{name} is not finite")

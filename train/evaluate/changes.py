@@ -1,32 +1,44 @@
 """Paired changes of a comparison: every residual against its base and against the best policy without learning.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first policy.
+Every baseline is compared with the base of the residuals, or without residuals with the first
+policy.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 
 from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
-from train.evaluate.conditions import Condition, Member
+from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation, grouped
-from train.evaluate.families import Origin, origin
-from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, pair
+from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.families import Origin
+from train.evaluate.statistics import (
+    Estimate,
+    change,
+    improvement,
+    interquartile_mean,
+    over_seeds,
+    wins,
+)
+from train.evaluate.table import EpisodeTable, failures
 
-CEILING, SAME_ROBOT = "ceiling on the training condition", "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot is that of the
-training, so that evaluation differs by noise alone."""
-HELD_OUT, PARTLY = "held out", "partly held out"
+CEILING = "ceiling on the training condition"
+SAME_ROBOT = "trained robot"
+"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot
+is that of the training, so that evaluation differs by noise alone."""
+HELD_OUT = "held out"
+PARTLY = "partly held out"
 """Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
 """What a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
-misses the truth, over five every eleventh."""
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds
+every other one misses the truth, over five every eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any effect."""
 
@@ -39,35 +51,30 @@ _SMALL = 0.0995
 _LEAST = 0.005
 """Below it a bound would look like zero without one."""
 
+Verdict = Literal["lower", "higher", "none", "unclear"]
 Groups = Mapping[str, Sequence[str]]
-Cells = Sequence[tuple[Sequence[Evaluation], Sequence[Evaluation]]]
-"""Evaluations of a policy, one per training seed, and those of whom it is compared with; of one cell or of several."""
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
     """A policy against its base in one metric, in one scenario or pooled over a group of them.
 
-    Attributes:
-        policy, base: Titles.
-        is_family: Whether the policy is a residual, so that it has training seeds.
-        reference: Label of the motion.
-        scope: Scenario, or name of the group.
-        is_group: Whether it is a group.
-        swept: Options that a sweep varies, and their values.
-        marks: What the reader has to know of the row: a ceiling, something held out.
-        column: The metric.
-        is_judged: Whether policies are judged by it; else it stands in tables alone.
-        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
-        relative: Interquartile mean of it over training seeds.
-        improvement: Probability that an episode is better than the base's.
-        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile mean over training
+    Attributes: policy, base: Titles. is_family: Whether the policy is a residual, so that it has
+        training seeds. reference: Label of the motion. scope: Scenario, or name of the group.
+        is_group: Whether it is a group. swept: Options that a sweep varies, and their values.
+        marks: What the reader has to know of the row: a ceiling, something held out. column: The
+        metric. is_judged: Whether policies are judged by it; else it stands in tables alone.
+        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
+        baseline one value. relative: Interquartile mean of it over training seeds. improvement:
+        Probability that an episode is better than the base's. mine, theirs: Metric of the policy
+        and of its base over the pairs [SI]; the interquartile mean over training
             seeds.
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
-        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
+        is_rival: Whether `base` is not the base of the residual but the best policy without
+            learning.
     """
 
     policy: str
@@ -104,9 +111,10 @@ class Change:
         return int(np.isfinite(self.per_seed).sum())
 
     @property
-    def verdict(self) -> str:
+    def verdict(self) -> Verdict:
         """lower, higher, none (the interval includes zero), or unclear (too few training seeds to say)."""
-        low, high = self.relative.low, self.relative.high
+        low = self.relative.low
+        high = self.relative.high
         if low is None or high is None or self.num_compared < FEWEST_SEEDS:
             return "unclear"
         return "lower" if high < 0.0 else "higher" if low > 0.0 else "none"
@@ -191,16 +199,7 @@ def signed_interval(estimate: Estimate, verdict: str) -> str:
     return signed_off(text, verdict) if np.isfinite(estimate.value) else text
 
 
-def families(evaluations: Sequence[Evaluation]) -> dict[str, Origin]:
-    """Families of residuals by title, with how they were trained."""
-    members: dict[str, dict[str, Member]] = {}
-    for title, member in ((e.condition.policy.title, e.condition.member) for e in evaluations):
-        if member is not None:
-            members.setdefault(title, {})[member.folder] = member
-    return {title: origin(list(found.values())) for title, found in members.items()}
-
-
-def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
+def merge_seeds(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
     """Cells with the training seeds of a family put together: all of their episodes, the trace of the first."""
     together: dict[tuple[object, ...], Evaluation] = {}
     for number, e in enumerate(evaluations):
@@ -209,8 +208,22 @@ def merged(evaluations: Sequence[Evaluation]) -> list[Evaluation]:
         if key in together:
             together[key].episodes.extend(e.episodes)
         else:
-            together[key] = Evaluation(c, list(e.episodes), e.trace, e.points, e.rest_references)
+            together[key] = replace(e, episodes=list(e.episodes))
     return list(together.values())
+
+
+def opponents(table: EpisodeTable) -> dict[str, list[str]]:
+    """Titles of those whom each policy is compared with: base and rival, or of a baseline the bases, or the first."""
+    members = {title: next(reversed(own.values())) for title, own in table.members.items()}
+    default = list(dict.fromkeys(member.base for member in members.values())) or table.policies[:1]
+    found = {}
+    for title in table.policies:
+        member = members.get(title)
+        if member is None:
+            found[title] = [base for base in default if base != title]
+        else:
+            found[title] = [other for other in (member.base, member.rival) if other is not None]
+    return found
 
 
 def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> list[Change]:
@@ -220,117 +233,200 @@ def changes(evaluations: Sequence[Evaluation], groups: Groups | None = None) -> 
         evaluations: All cells, one per training seed.
         groups: Scenarios to pool over, by name.
     """
-    trained = families(evaluations)
-    members = {e.condition.policy.title: e.condition.member for e in evaluations if e.condition.member}
+    table = EpisodeTable(evaluations)
     rows = []
-    for title, others in opponents(evaluations).items():
-        own = [e for e in evaluations if e.condition.policy.title == title]
-        member = members.get(title)
+    for title, others in opponents(table).items():
         for base in others:
-            theirs = [e for e in evaluations if e.condition.policy.title == base]
-            found = _against(own, theirs, trained.get(title), groups or {})
-            is_rival = member is not None and base == member.rival
-            rows += [replace(row, is_rival=True) for row in found] if is_rival else found
+            if base in table.policies:
+                rows += _against(Pairing(table, title, base), groups or {})
     return rows
 
 
-def opponents(evaluations: Sequence[Evaluation]) -> dict[str, list[str]]:
-    """Titles of those whom each policy is compared with: base and rival, or of a baseline the bases, or the first."""
-    titles = list(dict.fromkeys(e.condition.policy.title for e in evaluations))
-    members = {e.condition.policy.title: e.condition.member for e in evaluations if e.condition.member}
-    default = list(dict.fromkeys(member.base for member in members.values())) or titles[:1]
-    found = {}
-    for title in titles:
-        member = members.get(title)
-        found[title] = [base for base in default if base != title] if member is None else [member.base]
-        if member is not None and member.rival is not None:
-            found[title].append(member.rival)
-    return found
-
-
-def level(members: Sequence[Evaluation], column: Column) -> Estimate:
-    """Mean of a metric over the episodes that did not fail; of several training seeds the interquartile mean [SI].
+class Pairing:
+    """A policy beside another one on the same episodes.
 
     Args:
-        members: One cell, an evaluation per training seed.
-        column: The metric.
+        table: All episodes.
+        policy: Title of the policy.
+        base: Title of the other one.
+
+    Raises:
+        ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
     """
-    values = [e.values(column.metric) for e in members]
-    means = [float(np.mean(some)) if len(some) else float("nan") for some in values]
-    return over_seeds(means) if members[0].condition.member is not None else Estimate(means[0])
+
+    def __init__(self, table: EpisodeTable, policy: str, base: str) -> None:
+        self.table = table
+        self.policy = policy
+        self.base = base
+        known = table.environment
+        self.columns = (*known.judged, *known.also)
+        self.cells = {cell: other for cell in table.cells_of(policy) if (other := self._cell_of_base(cell)) is not None}
+        """Number of the base's cell, by that of the policy's."""
+        self._pairs: dict[tuple[int, str], pd.DataFrame] = {}
+
+    def _cell_of_base(self, cell: int) -> int | None:
+        """The same cell; where the base is not swept, the one of its level."""
+        condition = self.table.conditions[self.policy, cell]
+        for place in (condition.cell, condition.cell[:2]):
+            number = self.table.cells.get(place)
+            if number is not None and (self.base, number) in self.table.conditions:
+                return number
+        return None
+
+    def pairs(self, cell: int, metric: str) -> pd.DataFrame:
+        """Figures of every training seed over the pairs of a cell: means `mine` and `base`, number `played`, `won`."""
+        if (cell, metric) not in self._pairs:
+            mine = self.table.of(self.policy, cell)
+            base = self.table.of(self.base, self.cells[cell])
+            both = pair(mine, base, metric)
+            figures = []
+            for member in mine["member"].unique():
+                own = both[both["member"] == member]
+                ours = np.asarray(own["mine"])
+                theirs = np.asarray(own["base"])
+                figures.append(
+                    {
+                        "mine": ours.mean() if len(own) else np.nan,
+                        "base": theirs.mean() if len(own) else np.nan,
+                        "played": len(own),
+                        "won": wins(ours, theirs),
+                    }
+                )
+            self._pairs[cell, metric] = pd.DataFrame(figures)
+        return self._pairs[cell, metric]
+
+    def change(
+        self,
+        column: Column,
+        cells: Sequence[int],
+        scope: str,
+        is_group: bool,
+        marks: tuple[str, ...] = (),
+    ) -> Change:
+        """The change of one metric, over one cell or pooled over several.
+
+        Args:
+            column: The metric.
+            cells: Numbers of the policy's cells.
+            scope: Scenario, or name of the group.
+            is_group: Whether it is a group.
+            marks: See `Change`.
+        """
+        pairs = [self.pairs(cell, column.metric) for cell in cells]
+        mine, base, played, won = (
+            np.column_stack([own[name] for own in pairs]) for name in ("mine", "base", "played", "won")
+        )
+        relative = change(mine, base)
+        condition = self.table.conditions[self.policy, cells[0]]
+        falls, episodes = failures(self.table.of(self.policy, *cells))
+        base_falls, base_episodes = failures(self.table.of(self.base, *(self.cells[cell] for cell in cells)))
+        return Change(
+            policy=self.policy,
+            base=self.base,
+            is_family=condition.member is not None,
+            reference=condition.reference_name,
+            scope=scope,
+            is_group=is_group,
+            swept=condition.swept,
+            marks=marks,
+            column=column,
+            is_judged=column in self.table.environment.judged,
+            per_seed=relative,
+            relative=over_seeds(relative),
+            improvement=improvement(won, played),
+            mine=_mean(mine),
+            theirs=_mean(base),
+            num_pairs=int(played.sum()),
+            falls=falls,
+            episodes=episodes,
+            base_falls=base_falls,
+            base_episodes=base_episodes,
+            failure=self.table.environment.failures,
+            is_rival=condition.member is not None and self.base == condition.member.rival,
+        )
 
 
-def by_cell(evaluations: Sequence[Evaluation]) -> dict[tuple[object, ...], list[Evaluation]]:
-    """Evaluations of a policy by reference, scenario and swept values: one per training seed."""
-    return grouped(evaluations, lambda e: e.condition.cell)
+class Pairings:
+    """Policies of a table beside one another, each pair made once.
+
+    Args:
+        table: All episodes.
+    """
+
+    def __init__(self, table: EpisodeTable) -> None:
+        self.table = table
+        self._found: dict[tuple[str, str], Pairing] = {}
+
+    def of(self, policy: str, base: str) -> Pairing:
+        """A policy beside another one, by their titles."""
+        if (policy, base) not in self._found:
+            self._found[policy, base] = Pairing(self.table, policy, base)
+        return self._found[policy, base]
 
 
-def _against(own: Sequence[Evaluation], base: Sequence[Evaluation], trained: Origin | None, groups: Groups
-             ) -> list[Change]:  # fmt: skip
-    """Rows of one policy and one base: every cell, and every group."""
-    mine, theirs = by_cell(own), by_cell(base)
-    cells = {key: (found, theirs.get(key, theirs.get(key[:2], []))) for key, found in mine.items()}
-    cells = {key: both for key, both in cells.items() if both[1]}
+def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Episodes of two policies in one cell with the same seed, in which neither failed: `member`, `mine`, `base`.
+
+    Args:
+        mine: Rows of a policy, with `member`, `seed`, `failed` and the metric.
+        base: Rows of the base, with a row per seed.
+        metric: Name of the metric.
+
+    Raises:
+        ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
+    """
+    for rows in (mine, base):
+        if rows.duplicated(["member", "seed"]).any():
+            raise ValueError(f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}")
+    own = pd.DataFrame({"member": mine["member"], "seed": mine["seed"], "mine": mine[metric]})
+    others = pd.DataFrame({"seed": base["seed"], "base": base[metric]})
+    return own.merge(others, on="seed").sort_values("seed", kind="stable").dropna()
+
+
+def _against(pairing: Pairing, groups: Groups) -> list[Change]:
+    """Rows of one policy and one base: every cell, and every group behind the last one of its scenarios."""
+    conditions = {cell: pairing.table.conditions[pairing.policy, cell] for cell in pairing.cells}
+    blocks = group_by(conditions, lambda cell: _apart_from_scenario(conditions[cell]))
     rows = []
-    for (reference, scenario, *swept), (ours, others) in cells.items():
-        rows += _rows(str(scenario), [(ours, others)], trained, is_group=False)
-        last = [key for key in cells if key[0] == reference and list(key[2:]) == swept][-1]
-        if scenario != last[1]:
+    for cell, condition in conditions.items():
+        rows += _scope_rows(pairing, condition.scenario, [cell], is_group=False)
+        block = {conditions[own].scenario: own for own in blocks[_apart_from_scenario(condition)]}
+        if cell != list(block.values())[-1]:
             continue
         for name, scenarios in groups.items():
-            found = [cells.get((reference, s, *swept)) for s in scenarios]
-            if all(found):
-                rows += _rows(name, [both for both in found if both is not None], trained, is_group=True)
+            if all(scenario in block for scenario in scenarios):
+                rows += _scope_rows(pairing, name, [block[s] for s in scenarios], is_group=True)
     return rows
 
 
-def _rows(scope: str, cells: Cells, trained: Origin | None, is_group: bool) -> list[Change]:
+def _apart_from_scenario(condition: Condition) -> tuple[object, ...]:
+    return (condition.reference_name, *condition.swept.items())
+
+
+def _scope_rows(pairing: Pairing, scope: str, cells: Sequence[int], is_group: bool) -> list[Change]:
     """A row per judged column, over one scenario or several."""
-    first = cells[0][0][0].condition
-    known = first.environment
-    scenarios = [_seen_as(ours[0].condition, trained) for ours, _ in cells]
-    marks = _marks(trained, known, _motion(known, first.reference), scenarios, first.swept)
-    return [_row(scope, cells, column, marks, is_group) for column in (*known.judged, *known.also)]
+    table = pairing.table
+    trained = table.families.get(pairing.policy)
+    first = table.conditions[pairing.policy, cells[0]]
+    scenarios = [_seen_as(table.conditions[pairing.policy, cell], trained) for cell in cells]
+    reference = _motion(table.environment, first.reference)
+    marks = _marks(trained, table.environment, reference, scenarios, first.swept)
+    return [pairing.change(column, cells, scope, is_group, marks) for column in pairing.columns]
 
 
-def paired(cells: Cells, column: Column) -> Change:
-    """A policy against another one in one metric, in one cell or pooled over several; without marks."""
-    return _row(cells[0][0][0].condition.scenario, cells, column, (), is_group=len(cells) > 1)
-
-
-def _row(scope: str, cells: Cells, column: Column, marks: tuple[str, ...], is_group: bool) -> Change:
-    """The change of one metric, over one scenario or several."""
-    first, base = cells[0][0][0].condition, cells[0][1][0].condition
-    mine = [e for ours, _ in cells for e in ours]
-    theirs = [e for _, others in cells for e in others]
-    known = first.environment
-    seeds = [
-        [pair(ours[number].episodes, others[0].episodes, column.metric) for ours, others in cells]
-        for number in range(len(cells[0][0]))
-    ]
-    per_seed = np.array([change(pairs) for pairs in seeds])
-    return Change(
-        policy=first.policy.title, base=base.policy.title, is_family=first.member is not None,
-        reference=first.reference_name, scope=scope, is_group=is_group, swept=first.swept,
-        marks=marks, column=column, is_judged=column in known.judged,
-        per_seed=per_seed, relative=over_seeds(per_seed.tolist()), improvement=improvement(seeds),
-        mine=_mean([[p.mine for p in pairs] for pairs in seeds]),
-        theirs=_mean([[p.base for p in pairs] for pairs in seeds]),
-        num_pairs=sum(len(p) for pairs in seeds for p in pairs),
-        falls=sum(e.num_failed for e in mine), episodes=sum(len(e.episodes) for e in mine),
-        base_falls=sum(e.num_failed for e in theirs), base_episodes=sum(len(e.episodes) for e in theirs),
-        failure=known.failures,
-    )  # fmt: skip
-
-
-def _mean(seeds: Sequence[Sequence[Array]]) -> float:
+def _mean(values: Array) -> float:
     """Interquartile mean, over the training seeds that have all, of means over scenarios and episodes."""
-    means = [np.mean([values.mean() for values in some]) for some in seeds if all(len(values) for values in some)]
-    return float(interquartile_mean(np.array(means))) if means else float("nan")
+    means = np.mean(values, axis=-1)
+    means = means[np.isfinite(means)]
+    return float(interquartile_mean(means)) if len(means) else float("nan")
 
 
 def _marks(
-    trained: Origin | None, known: Environment, reference: str, scenarios: Sequence[str], swept: Mapping[str, float]
+    trained: Origin | None,
+    known: Environment,
+    reference: str,
+    scenarios: Sequence[str],
+    swept: Mapping[str, float],
 ) -> tuple[str, ...]:
     """What training has seen of a row's condition."""
     if trained is None:
@@ -359,7 +455,8 @@ def _marks(
 
 def _seen_as(condition: Condition, trained: Origin | None) -> str:
     """The scenario of a condition; one whose fields are varied by the name under which training has seen the same."""
-    played, ranges = condition.scenario_played, {} if trained is None else trained.ranges
+    played = condition.scenario_played
+    ranges = {} if trained is None else trained.ranges
     if isinstance(played, str) and not ranges:
         return played
     seen = trained.scenarios if trained is not None and trained.scenarios is not None else ()
@@ -369,7 +466,10 @@ def _seen_as(condition: Condition, trained: Origin | None) -> str:
     )
     if condition.swept:
         return next(same, f"varied {condition.scenario}")
-    return next(same, f"{condition.scenario} of other ranges" if condition.scenario in seen else condition.scenario)
+    return next(
+        same,
+        f"{condition.scenario} of other ranges" if condition.scenario in seen else condition.scenario,
+    )
 
 
 def _motion(known: Environment, reference: Any) -> str:
@@ -379,5 +479,5 @@ def _motion(known: Environment, reference: Any) -> str:
 
 def by_line(rows: Sequence[Change]) -> list[list[Change]]:
     """Changes of the same policy, base and cell together, one per metric."""
-    lines = grouped(rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items()))
+    lines = group_by(rows, lambda row: (row.policy, row.base, row.reference, row.scope, *row.swept.items()))
     return list(lines.values())

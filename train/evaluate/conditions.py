@@ -12,7 +12,14 @@ from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantit
 from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.runtime.scenario import MOST_RANGES, Scenario, make_scenario
-from train.evaluate.environments import ENVIRONMENTS, RESERVED, UNPLACED, Environment, Reference, environment
+from train.evaluate.environments import (
+    ENVIRONMENTS,
+    RESERVED,
+    UNPLACED,
+    Environment,
+    Reference,
+    environment,
+)
 
 MOST_EPISODES = 100_000
 """Episodes of a cell."""
@@ -55,10 +62,11 @@ def _ranges(value: Any) -> Any:
 
 
 GivenRanges = Annotated[
-    dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)], AfterValidator(_ranges)
+    dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)],
+    AfterValidator(_ranges),
 ]
-"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`; or several such
-mappings, each of an equal share of the robots."""
+"""Intervals of drawn robots that differ from those of their scenario, by the names of
+`RobotRanges`; or several such mappings, each of an equal share of the robots."""
 
 
 def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
@@ -106,8 +114,8 @@ class Member(Model):
     base: str
     """Title of the policy that it corrects."""
     rival: str | None = None
-    """Title of the best policy without learning and with the standard sensors; None where that is the base, or nobody
-    plays it."""
+    """Title of the best policy without learning and with the standard sensors; None where that is
+    the base, or nobody plays it."""
 
 
 class Condition(Model):
@@ -118,8 +126,9 @@ class Condition(Model):
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
     reference: GivenReference = "hold"
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
-    or a mapping with `step_period` and further arguments of the environment."""
+    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
+    three durations [s], or a mapping with `step_period` and further arguments of the
+    environment."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
@@ -131,7 +140,11 @@ class Condition(Model):
     """What is varied, and its value here: an option of the policy, or with `SCENARIO` before it one of the scenario."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
     seed: int = quantity(
-        "1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode; the next ones follow"
+        "1",
+        0,
+        ge=0,
+        le=LARGEST_SEED - MOST_EPISODES,
+        description="seed of the first episode; the next ones follow",
     )
 
     _checked = field_validator("env_options")(_options)
@@ -163,7 +176,12 @@ class Condition(Model):
         The environment also has the sensors that a baseline reads.
         """
         motion = self.environment.arguments(self.reference)
-        found = {"scenario": self.scenario_played, **self.env_options, **self.policy.env_options, **motion}
+        found = {
+            "scenario": self.scenario_played,
+            **self.env_options,
+            **self.policy.env_options,
+            **motion,
+        }
         needed = sensors_needed(self.policy.name)
         given = found.get("sensors", [])
         if not needed or not isinstance(given, list | tuple):  # the environment says what sensors are

@@ -19,9 +19,16 @@ Reference: TypeAlias = str | float | list[float] | dict[str, Any]
 """The motion: a name, a number, durations, or a mapping of parameters; each environment says which of them it takes."""
 
 UNPLACED = (
-    "num_envs", "num_threads", "autoreset_mode", "render_mode", "id", "vectorization_mode", "vector_kwargs", "wrappers",
+    "num_envs",
+    "num_threads",
+    "autoreset_mode",
+    "render_mode",
+    "id",
+    "vectorization_mode",
+    "vector_kwargs",
+    "wrappers",
     "self",
-)  # fmt: skip
+)
 """Arguments of the environments, and of the functions that make them, that have no place in a comparison."""
 RESERVED = ("scenario", *UNPLACED)
 """These, and the argument that has a key of its own."""
@@ -95,35 +102,27 @@ class TracedSignal:
 class Environment:
     """An environment as the commands see it.
 
-    Attributes:
-        id: Its name for `gymnasium.make`.
-        robot: Name of its task, under which trained policies are kept.
-        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
-        default_reference: Reference where none is named.
-        watched_reference: The same for a picture; None for the default.
-        looped_policy: Policy in the loop of which the speed is measured, the best that needs no truth.
-        live_policy: Policy that is timed against the clock; None for the looped one.
-        on_hardware: Short name of the same robot on hardware; empty where there is none.
-        arguments: Arguments of `gymnasium.make` for a reference.
-        label: How tables and figures call a reference.
-        draws: Whether episodes of a reference have motions of their own.
-        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where there is nothing.
-        traced: Signals of the first episode that are kept.
-        columns: The summary table.
-        splits: Further tables of the summary, title and columns.
-        subject: What the summary table is about.
-        note: What its reader has to know beside the legend of the columns.
-        figures: Names of the time series to draw, see `train.figures.figures`.
-        overview: Column of the bar chart.
-        swept: Columns drawn against a swept value.
-        learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.
-        judged: Columns that policies are compared by, pair by pair.
-        also: Columns whose paired changes stand in the tables too.
-        curves: Signals over time in the report.
-        quantity: What a reference is, in titles; empty where its label says it.
-        failure: Heading for episodes that end before their time.
-        is_real: Whether it is hardware: one world at a time, in this process, without a truth to score by.
-        walks: Whether its policies are those of the walker.
+    Attributes: id: Its name for `gymnasium.make`. robot: Name of its task, under which trained
+        policies are kept. motion: Argument of `gymnasium.make` that says which motion is played;
+        what a configuration calls its reference. default_reference: Reference where none is named.
+        watched_reference: The same for a picture; None for the default. looped_policy: Policy in
+        the loop of which the speed is measured, the best that needs no truth. live_policy: Policy
+        that is timed against the clock; None for the looped one. on_hardware: Short name of the
+        same robot on hardware; empty where there is none. arguments: Arguments of `gymnasium.make`
+        for a reference. label: How tables and figures call a reference. draws: Whether episodes of
+        a reference have motions of their own. abscissa: What of a reference sweeps can be drawn
+        against, by name with unit; empty where there is nothing. traced: Signals of the first
+        episode that are kept. columns: The summary table. splits: Further tables of the summary,
+        title and columns. subject: What the summary table is about. note: What its reader has to
+        know beside the legend of the columns. figures: Names of the time series to draw, see
+        `train.figures.comparison_figures`. overview: Column of the bar chart. swept: Columns drawn
+        against a swept value. learned_from: Further arguments of worlds that are learned from,
+        which keep them apart from those of evaluation. judged: Columns that policies are compared
+        by, pair by pair. also: Columns whose paired changes stand in the tables too. curves:
+        Signals over time in the report. quantity: What a reference is, in titles; empty where its
+        label says it. failure: Heading for episodes that end before their time. is_real: Whether it
+        is hardware: one world at a time, in this process, without a truth to score by. walks:
+        Whether its policies are those of the walker.
     """
 
     id: str
@@ -180,8 +179,8 @@ _STEPS_OF_THE_PAPER = {"24 s": 2}
 def environment(name: str) -> Environment:
     """The environment of a short name, or that of a robot of one's own.
 
-    Args:
-        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or "module:ROBOT", a
+    Args: name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT"
+        or "module:ROBOT", a
             `JointRobot`, which is imported and registered.
 
     Raises:
@@ -227,7 +226,10 @@ def _step_period(reference: Reference) -> Any:
 
 
 def _walk_arguments(reference: Reference) -> dict[str, Any]:
-    return {**(reference if isinstance(reference, dict) else {}), "step_period": _step_period(reference)}
+    return {
+        **(reference if isinstance(reference, dict) else {}),
+        "step_period": _step_period(reference),
+    }
 
 
 def _walk_label(reference: Reference) -> str:
@@ -256,7 +258,13 @@ _TESTBED = Environment(
     draws=lambda reference: make_reference(reference).is_random,  # pyright: ignore[reportArgumentType]
     abscissa=lambda _: {},
     traced=(
-        "time_s", "reference_angle", "link_angle", "link_angle_imu", "deflection", "link_error", "link_error_imu",
+        "time_s",
+        "reference_angle",
+        "link_angle",
+        "link_angle_imu",
+        "deflection",
+        "link_error",
+        "link_error_imu",
         "joint_torque",
     ),
     columns=(
@@ -278,7 +286,7 @@ _TESTBED = Environment(
     watched_reference="sine",
     looped_policy="input",
     on_hardware="hardware",
-)  # fmt: skip
+)
 
 _JOINTS = replace(
     _TESTBED,
@@ -300,8 +308,16 @@ _TOOL = Column("end effector error rms", "end_effector_error_rms_m")
 _WITH_END_EFFECTOR = replace(
     _JOINTS,
     columns=(
-        Column("end effector", "end_effector_error_rms_m", note="rms distance from where the reference has it"),
-        Column("tilt", "end_effector_tilt_rms_rad", note="rms angle of the end effector from the reference"),
+        Column(
+            "end effector",
+            "end_effector_error_rms_m",
+            note="rms distance from where the reference has it",
+        ),
+        Column(
+            "tilt",
+            "end_effector_tilt_rms_rad",
+            note="rms angle of the end effector from the reference",
+        ),
         *_JOINTS.columns,
     ),
     traced=("time_s", "end_effector_error", "end_effector_tilt", *_JOINTS.traced[1:]),
@@ -314,7 +330,8 @@ _WITH_END_EFFECTOR = replace(
 )
 """The same robots where what counts is the place of an end effector."""
 
-_ROLL, _ZMP = Column("roll rms", "pelvis_roll_rms_rad"), Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
+_ROLL = Column("roll rms", "pelvis_roll_rms_rad")
+_ZMP = Column("ZMP rms", "zmp_deviation_rms_m", decimals=1)
 
 _WALKER = Environment(
     id=IDS["walker"],
@@ -326,8 +343,18 @@ _WALKER = Environment(
     draws=lambda _: False,
     abscissa=_walk_abscissa,
     traced=(
-        "time_s", "pelvis_roll", "pelvis_pitch", "zmp_x", "zmp_y", "zmp_reference_x", "zmp_reference_y",
-        "single_support", "support", "load_share", "force_left", "force_right",
+        "time_s",
+        "pelvis_roll",
+        "pelvis_pitch",
+        "zmp_x",
+        "zmp_y",
+        "zmp_reference_x",
+        "zmp_reference_y",
+        "single_support",
+        "support",
+        "load_share",
+        "force_left",
+        "force_right",
     ),
     columns=(
         _ROLL,
@@ -337,7 +364,12 @@ _WALKER = Environment(
         _ZMP,
         Column("ZMP x rms", "zmp_deviation_x_rms_m", on_console=False, decimals=1),
         Column("ZMP y rms", "zmp_deviation_y_rms_m", on_console=False, decimals=1),
-        Column("IMU", "imu_error_rms_rad", on_console=False, note="error of its attitude, roll and pitch together"),
+        Column(
+            "IMU",
+            "imu_error_rms_rad",
+            on_console=False,
+            note="error of its attitude, roll and pitch together",
+        ),
         Column("early", "early_touchdown_mean_s", decimals=0, note="swing foot down before its time"),
         Column("e mean", "frame_error_mean_m", decimals=1, note="Eq. 1 at the support changes"),
         Column("COM jump", "com_jump_mean_m", decimals=1),
@@ -348,7 +380,9 @@ _WALKER = Environment(
             tuple(
                 Column(f"{title} {phase}", f"{metric}_{phase}_rms_{unit}")
                 for title, metric, unit in (
-                    ("roll", "pelvis_roll", "rad"), ("pitch", "pelvis_pitch", "rad"), ("ZMP", "zmp_deviation", "m"),
+                    ("roll", "pelvis_roll", "rad"),
+                    ("pitch", "pelvis_pitch", "rad"),
+                    ("ZMP", "zmp_deviation", "m"),
                 )
                 for phase in ("double", "single", "transition")
             ),
@@ -357,10 +391,19 @@ _WALKER = Environment(
     subject="pelvis and ZMP of the walk",
     figures=("pelvis", "zmp"),
     overview=Column("pelvis roll rms", "pelvis_roll_rms_rad"),
-    swept=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
-    judged=(Column("pelvis error rms", "pelvis_error_rms_rad"), Column("ZMP deviation rms", "zmp_deviation_rms_m")),
+    swept=(
+        Column("pelvis roll rms", "pelvis_roll_rms_rad"),
+        Column("ZMP deviation rms", "zmp_deviation_rms_m"),
+    ),
+    judged=(
+        Column("pelvis error rms", "pelvis_error_rms_rad"),
+        Column("ZMP deviation rms", "zmp_deviation_rms_m"),
+    ),
     learned_from={"bank": 1},
-    also=(Column("pelvis roll rms", "pelvis_roll_rms_rad"), Column("pelvis pitch rms", "pelvis_pitch_rms_rad")),
+    also=(
+        Column("pelvis roll rms", "pelvis_roll_rms_rad"),
+        Column("pelvis pitch rms", "pelvis_pitch_rms_rad"),
+    ),
     curves=(
         TracedSignal("pelvis roll", "pelvis_roll", "mrad", 1e3),
         TracedSignal("pelvis pitch", "pelvis_pitch", "mrad", 1e3),
@@ -371,7 +414,7 @@ _WALKER = Environment(
     walks=True,
     looped_policy="input_wrench",
     live_policy="adaptive_posture",
-)  # fmt: skip
+)
 
 _HARDWARE = replace(
     _TESTBED,
@@ -384,8 +427,10 @@ _HARDWARE = replace(
 )
 
 _OWN = {
-    "testbed": _TESTBED, "walker": _WALKER, "hardware": _HARDWARE,
+    "testbed": _TESTBED,
+    "walker": _WALKER,
+    "hardware": _HARDWARE,
     "robot": replace(_WITH_END_EFFECTOR, id=IDS["robot"], robot="robot", default_reference="poses"),
-}  # fmt: skip
+}
 ENVIRONMENTS = {name: _OWN.get(name) or replace(_JOINTS, id=known, robot=name) for name, known in IDS.items()}
 """Environments by their short names: those with figures of their own, and other robots of elastic joints."""

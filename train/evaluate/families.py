@@ -1,6 +1,7 @@
 """Policies of a comparison with all training seeds of a residual, and with whom each residual is compared.
 
-A residual is compared with its base, and with the best policy without learning that reads the same sensors.
+A residual is compared with its base, and with the best policy without learning that reads the same
+sensors.
 """
 
 import difflib
@@ -66,8 +67,8 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
         with_bases: Whether a base or a rival that is not among them is added, before its residual.
 
-    Raises:
-        ConfigurationError: A pattern that matches no folder, a folder without residual, or folders that do not belong
+    Raises: ConfigurationError: A pattern that matches no folder, a folder without residual, or
+        folders that do not belong
             together.
     """
     entrants: list[Entrant] = []
@@ -111,7 +112,8 @@ def origin(members: Sequence[Member]) -> Origin:
     descriptions = [read_description(Path(member.folder)) for member in members]
     config = descriptions[0].origin.config
     scenarios = config.scenarios
-    wanted, had = set(config.seeds), {member.training_seed for member in members}
+    wanted = set(config.seeds)
+    had = {member.training_seed for member in members}
     return Origin(
         scenarios=None if scenarios is None else tuple(scenarios),
         reference=config.reference,
@@ -124,7 +126,8 @@ def origin(members: Sequence[Member]) -> Origin:
 
 def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]:
     """Folders of a pattern in natural order, with training seed and description; shipped ones where none lie there."""
-    is_family, folders = bool(_WILD.search(pattern)), [Path(pattern)]
+    is_family = bool(_WILD.search(pattern))
+    folders = [Path(pattern)]
     if is_family:
         folders = sorted(_matching(pattern) or map(Path, fnmatch.filter(shipped(), pattern)), key=_natural)
         if not folders:
@@ -139,8 +142,8 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
 def _matching(pattern: str) -> list[Path]:
     """Folders whose paths match a pattern.
 
-    Raises:
-        ConfigurationError: The pattern stands for folders of any depth, which may be all of the disk.
+    Raises: ConfigurationError: The pattern stands for folders of any depth, which may be all of the
+        disk.
     """
     if "**" in pattern:
         raise ConfigurationError(f"* stands for one part of a path, got {shown(pattern)}; leave ** out")
@@ -153,7 +156,8 @@ def _matching(pattern: str) -> list[Path]:
 
 def _require_motion(folder: Path, description: ResidualDescription) -> None:
     """Refuse a residual whose training names a motion that its environment cannot read: the report would need it."""
-    known, reference = ENVIRONMENTS.get(description.robot), description.origin.config.reference
+    known = ENVIRONMENTS.get(description.robot)
+    reference = description.origin.config.reference
     if known is None or reference is None:
         return
     try:
@@ -185,7 +189,8 @@ def _require_one_family(pattern: str, members: Sequence[tuple[Path, int | None, 
     first, _, expected = members[0]
     seen: dict[int, Path] = {}
     for folder, seed, description in members:
-        mine, theirs = _kin(description), _kin(expected)
+        mine = _kin(description)
+        theirs = _kin(expected)
         for what in {**mine, **theirs}:
             if mine.get(what) != theirs.get(what):
                 raise ConfigurationError(
@@ -230,24 +235,37 @@ def _base(description: ResidualDescription, residual: PolicySpec, taken: Sequenc
     return _beside(residual, taken, description.base, f"base of {residual.title}", options)
 
 
-def _beside(residual: PolicySpec, taken: Sequence[PolicySpec], name: str, role: str, options: dict[str, object]
-            ) -> PolicySpec:  # fmt: skip
+def _beside(
+    residual: PolicySpec,
+    taken: Sequence[PolicySpec],
+    name: str,
+    role: str,
+    options: dict[str, object],
+) -> PolicySpec:
     """Whom a residual is compared with, under its name, or where a policy is called so under one that says its role."""
     label = f"{name} ({role})" if name in {policy.title for policy in taken} else None
-    return PolicySpec(name=name, label=label, options=options, env_options=residual.env_options, level=residual.level)
+    return PolicySpec(
+        name=name,
+        label=label,
+        options=options,
+        env_options=residual.env_options,
+        level=residual.level,
+    )
 
 
 def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
     """The best policy without learning, with the same sensors, in the same environment; None where that is the base.
 
-    One that is among the policies counts if it assumes the same stiffness, whatever its other options. Where the base
-    is that policy with options, it is compared with the plain one if that is among the policies.
+    One that is among the policies counts if it assumes the same stiffness, whatever its other
+    options. Where the base is that policy with options, it is compared with the plain one if that
+    is among the policies.
     """
     known = ENVIRONMENTS.get(description.robot)
     name = best_analytic(known is not None and known.walks)
     if name is None:
         return None
-    options, is_base = _base_options(description, residual), name == description.base
+    options = _base_options(description, residual)
+    is_base = name == description.base
     assumed = {option: value for option, value in options.items() if option in ASSUMED_OPTIONS}
     for policy in taken:
         given = _given(policy.options)

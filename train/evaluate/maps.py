@@ -14,11 +14,12 @@ from baselines.options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, shown
 from elastic_env.runtime.scenario import GROUNDS
-from train.evaluate.changes import Change, families, level, paired
+from train.evaluate.changes import Change, Pairings
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.episodes import Evaluation, group_by
 from train.evaluate.statistics import Estimate
+from train.evaluate.table import EpisodeTable, failures, score
 
 _UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3)}
 """Units in which an axis is shown, with the factor from SI."""
@@ -28,8 +29,9 @@ class Axis(Model):
     """An axis of a map."""
 
     what: Title
-    """A field of the scenario, such as scenario.stiffness_scale or scenario.pelvis_imu.bias_spread_rad, or the motion:
-    step_period on the walker, reference on the testbed."""
+    """A field of the scenario, such as scenario.stiffness_scale or
+    scenario.pelvis_imu.bias_spread_rad, or the motion: step_period on the walker, reference on the
+    testbed."""
     values: list[Any] = Field(min_length=2, max_length=MOST_ENTRIES)
     """Values in SI units; of the motion references as `references` has them."""
     label: Title | None = None
@@ -128,12 +130,11 @@ def _choices(what: str, known: Environment) -> str:
 class MapCell:
     """One cell of a map.
 
-    Attributes:
-        levels: Mean score of every policy over the episodes that did not fail; of residuals over training seeds [SI].
-        failed: Episodes of every policy that failed, and all.
-        best: The best policy; None where no episode of any reached its end.
-        best_analytic: The best one without learning and with the standard sensors.
-        learned: Paired change of every residual against that one.
+    Attributes: levels: Mean score of every policy over the episodes that did not fail; of residuals
+        over training seeds [SI]. failed: Episodes of every policy that failed, and all. best: The
+        best policy; None where no episode of any reached its end. best_analytic: The best one
+        without learning and with the standard sensors. learned: Paired change of every residual
+        against that one.
     """
 
     levels: Mapping[str, Estimate]
@@ -185,59 +186,68 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
         return ", ".join([*motion, e.condition.scenario])
 
     return [
-        _heat_map(title, own, config, column)
-        for title, own in grouped(evaluations, title_of).items()
-        for column in own[0].condition.environment.judged
+        heat_map
+        for title, own in group_by(evaluations, title_of).items()
+        for heat_map in _heat_maps(title, EpisodeTable(own), config)
     ]
 
 
-def _rank(scored: tuple[Estimate, tuple[int, int]]) -> tuple[float, float]:
-    estimate, (failed, played) = scored
-    value = estimate.value
-    return failed / max(played, 1), value if value == value else float("inf")  # nan equals nothing
-
-
 def best_of(scores: Mapping[str, tuple[Estimate, tuple[int, int]]]) -> str | None:
-    """Who has the lowest score among those with the smallest share of failures; None where nobody has a score.
+    """The policy with the lowest score among those with the smallest share of failures; None where nobody has a score.
 
-    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures count first.
+    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures
+    count first.
     """
-    known = {title: scored for title, scored in scores.items() if scored[0].value == scored[0].value}
-    return min(known, key=lambda title: _rank(known[title])) if known else None
+
+    def rank(title: str) -> tuple[float, float]:
+        estimate, (failed, played) = scores[title]
+        return failed / max(played, 1), estimate.value
+
+    return min((title for title in scores if scores[title][0].is_known), key=rank, default=None)
 
 
-def failed_of(members: Sequence[Evaluation]) -> tuple[int, int]:
-    """Episodes that failed, and all, over the training seeds of a policy."""
-    return sum(e.num_failed for e in members), sum(len(e.episodes) for e in members)
+def _heat_maps(title: str, table: EpisodeTable, config: MapConfig) -> list[HeatMap]:
+    """A map per judged metric."""
+    places = {
+        cell: (config.y.place(condition), config.x.place(condition))
+        for (_, cell), condition in table.conditions.items()
+    }
+    cells = {place: cell for cell, place in places.items()}
+    pairings = Pairings(table)
+    return [
+        HeatMap(
+            title=title,
+            column=column,
+            x=config.x,
+            y=config.y,
+            known=table.environment,
+            policies=tuple(table.policies),
+            families=tuple(table.members),
+            cells=tuple(
+                tuple(_cell(pairings, cells[row, place], column) for place in range(len(config.x.values)))
+                for row in range(len(config.y.values))
+            ),
+        )
+        for column in table.environment.judged
+    ]
 
 
-def _heat_map(title: str, evaluations: Sequence[Evaluation], config: MapConfig, column: Column) -> HeatMap:
-    cells = grouped(evaluations, lambda e: (config.y.place(e.condition), config.x.place(e.condition)))
-    known = evaluations[0].condition.environment
-    return HeatMap(
-        title=title, column=column, x=config.x, y=config.y, known=known,
-        policies=tuple(dict.fromkeys(e.condition.policy.title for e in evaluations)),
-        families=tuple(families(evaluations)),
-        cells=tuple(
-            tuple(_cell(cells[row, place], column) for place in range(len(config.x.values)))
-            for row in range(len(config.y.values))
-        ),
-    )  # fmt: skip
-
-
-def _cell(evaluations: Sequence[Evaluation], column: Column) -> MapCell:
+def _cell(pairings: Pairings, cell: int, column: Column) -> MapCell:
     """Scores of one cell, and residuals against the best policy without learning there."""
-    policies = grouped(evaluations, lambda e: e.condition.policy.title)
-    scores = {title: (level(own, column), failed_of(own)) for title, own in policies.items()}
-    tracks = {title: own[0].condition.track for title, own in policies.items()}
-    analytic = best_of({title: scored for title, scored in scores.items() if tracks[title] is Track.STANDARD})
-    learned = {} if analytic is None else {
-        title: paired([(own, policies[analytic])], column)
-        for title, own in policies.items() if own[0].condition.member is not None
-    }  # fmt: skip
+    table = pairings.table
+    played = {title: table.of(title, cell) for title in table.policies if (title, cell) in table.conditions}
+    scores = {title: (score(rows, column), failures(rows)) for title, rows in played.items()}
+    tracks = {title: table.conditions[title, cell].track for title in played}
+    analytic = best_of({title: own for title, own in scores.items() if tracks[title] is Track.STANDARD})
+    learned = [title for title in played if title in table.members and analytic is not None]
+    scenario = table.conditions[next(iter(played)), cell].scenario
     return MapCell(
-        levels={title: estimate for title, (estimate, _) in scores.items()},
+        levels={title: level for title, (level, _) in scores.items()},
         failed={title: failed for title, (_, failed) in scores.items()},
-        best=best_of({title: scored for title, scored in scores.items() if tracks[title] is not Track.TRUTH}),
-        best_analytic=analytic, learned=learned,
-    )  # fmt: skip
+        best=best_of({title: own for title, own in scores.items() if tracks[title] is not Track.TRUTH}),
+        best_analytic=analytic,
+        learned={
+            title: pairings.of(title, str(analytic)).change(column, [cell], scenario, is_group=False)
+            for title in learned
+        },
+    )

@@ -30,7 +30,10 @@ class RobotFile(Model):
     home: dict[str, float] | list[float] | None = None
     """Angles about which the joints follow a reference, by name or in order [rad]."""
     load_kg: float | None = quantity(
-        "kg", None, gt=0, description="the scenario `payload` adds a fifth of it at the end effector"
+        "kg",
+        None,
+        gt=0,
+        description="the scenario `payload` adds a fifth of it at the end effector",
     )
     imu: Locator | None = None
     """Site of the accelerometer."""
@@ -38,7 +41,10 @@ class RobotFile(Model):
     def arguments(self, folder: Path) -> dict[str, Any]:
         """Arguments of the environment; files are those of a folder."""
         given = {name: value for name, value in self.model_dump().items() if value is not None}
-        return {**given, **{name: str(folder / given[name]) for name in ("model", "joints") if _is_path(given[name])}}
+        return {
+            **given,
+            **{name: str(folder / given[name]) for name in ("model", "joints") if _is_path(given[name])},
+        }
 
 
 def read_robot_file(name: str) -> dict[str, Any]:

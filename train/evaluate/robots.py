@@ -1,17 +1,18 @@
 """Scores over drawn robots: how a policy does on the middle half of them, on the worst tenth, and against its base."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
-from elastic_env.core.signals import Array
 from elastic_env.runtime.scenario import make_scenario
-from train.evaluate.changes import by_cell, opponents
+from train.evaluate.changes import opponents
+from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation, grouped
-from train.evaluate.maps import failed_of
-from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, share_better, worst_share_mean
+from train.evaluate.episodes import Evaluation
+from train.evaluate.statistics import Estimate, interquartile_mean, wins, worst_share_mean
+from train.evaluate.table import EpisodeTable, estimate, failures, score
 
 FEWEST_ROBOTS = 4
 """Episodes from which on there is a middle half."""
@@ -21,14 +22,11 @@ FEWEST_ROBOTS = 4
 class RobotScores:
     """A policy in one metric over the drawn robots of a cell; of residuals over training seeds, with intervals.
 
-    Attributes:
-        policy, reference, scenario: Titles of the cell.
-        column: The metric.
-        mean: Mean over the robots [SI].
-        middle: Interquartile mean over the robots [SI].
-        worst: Mean of the worst tenth of the robots [SI].
-        failed, episodes: Episodes that failed, and all. The figures are of the others.
-        better: Share of the robots for which the policy is better than another one, by its title; ties count half,
+    Attributes: policy, reference, scenario: Titles of the cell. column: The metric. mean: Mean over
+        the robots [SI]. middle: Interquartile mean over the robots [SI]. worst: Mean of the worst
+        tenth of the robots [SI]. failed, episodes: Episodes that failed, and all. The figures are
+        of the others. better: Share of the robots for which the policy is better than another one,
+        by its title; ties count half,
             and to fail is worse than any value.
         failure: What failing is called, in the plural.
     """
@@ -52,54 +50,64 @@ def robot_scores(evaluations: Sequence[Evaluation]) -> list[RobotScores]:
     Args:
         evaluations: All cells, one per training seed.
     """
+    table = EpisodeTable(evaluations)
     found = []
-    others = opponents(evaluations)
-    policies = {title: by_cell(own) for title, own in grouped(evaluations, lambda e: e.condition.policy.title).items()}
-    for title, cells in policies.items():
-        for cell, members in cells.items():
-            reference, scenario, *swept = cell
-            if swept or not _draws_robots(members[0]):
+    for policy, others in opponents(table).items():
+        for cell in table.cells_of(policy):
+            condition = table.conditions[policy, cell]
+            rows = table.of(policy, cell)
+            if condition.swept or len(set(rows["seed"])) < FEWEST_ROBOTS or not _draws_robots(condition):
                 continue
-            against = {name: policies[name][cell][0] for name in others[title] if cell in policies.get(name, {})}
-            for column in members[0].condition.environment.judged:
-                found.append(_scores((title, str(reference), str(scenario)), members, column, against))
+            failed, episodes = failures(rows)
+            against = {other: table.of(other, cell) for other in others if (other, cell) in table.conditions}
+            found += [
+                RobotScores(
+                    policy=policy,
+                    reference=condition.reference_name,
+                    scenario=condition.scenario,
+                    column=column,
+                    mean=score(rows, column),
+                    middle=score(rows, column, _middle),
+                    worst=score(rows, column, lambda values: worst_share_mean(values.dropna().to_numpy())),
+                    failed=failed,
+                    episodes=episodes,
+                    better={other: _better(rows, theirs, column) for other, theirs in against.items()},
+                    failure=table.environment.failures,
+                )
+                for column in table.environment.judged
+            ]
     return found
 
 
-def _scores(
-    names: tuple[str, str, str], members: Sequence[Evaluation], column: Column, against: dict[str, Evaluation]
-) -> RobotScores:
-    """The scores of one cell and metric."""
-    is_family = members[0].condition.member is not None
-
-    def estimate(statistic: Callable[[Evaluation], float]) -> Estimate:
-        each = [statistic(e) for e in members]
-        return over_seeds(each) if is_family else Estimate(each[0])
-
-    def of_values(statistic: Callable[[Array], float]) -> Estimate:
-        return estimate(lambda e: statistic(v) if len(v := e.values(column.metric)) else float("nan"))
-
-    failed, episodes = failed_of(members)
-    return RobotScores(
-        *names,
-        column=column,
-        mean=of_values(lambda values: float(np.mean(values))),
-        middle=of_values(lambda values: float(interquartile_mean(values))),
-        worst=of_values(worst_share_mean),
-        failed=failed,
-        episodes=episodes,
-        better={
-            title: estimate(lambda e, other=other: share_better(e.episodes, other.episodes, column.metric))
-            for title, other in against.items()
-        },
-        failure=members[0].condition.environment.failures,
-    )
+def _middle(values: pd.Series) -> float:
+    known = values.dropna().to_numpy()
+    return float(interquartile_mean(known)) if len(known) else float("nan")
 
 
-def _draws_robots(e: Evaluation) -> bool:
-    known = e.condition.environment
-    return (
-        not known.is_real
-        and len(e.episodes) >= FEWEST_ROBOTS
-        and make_scenario(e.condition.scenario, known.walks).draws_robots
-    )
+def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:
+    """Share of the robots for which a policy is better than another one, over its training seeds."""
+    shares = [share_better(own, base, column.metric) for _, own in mine.groupby("member", sort=False)]
+    return estimate(mine, np.array(shares))
+
+
+def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
+    """Share of the episodes of both in which the policy is better (lower) than the base; ties count half.
+
+    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode
+    in common. An episode that reached its end without a figure, such as a ZMP of feet that never
+    carried anything, is left out.
+
+    Args:
+        mine: Episodes of one cell with `seed`, `failed` and the metric.
+        base: The same of the base.
+        metric: Name of the metric.
+    """
+    both = mine.merge(base, on="seed", suffixes=("", "_base"))
+    ranks = [both[f"{metric}{end}"].where(~both[f"failed{end}"], np.inf) for end in ("", "_base")]
+    values = pd.concat(ranks, axis=1).dropna().to_numpy()
+    return wins(*values.T) / len(values) if len(values) else float("nan")
+
+
+def _draws_robots(condition: Condition) -> bool:
+    known = condition.environment
+    return not known.is_real and make_scenario(condition.scenario, known.walks).draws_robots

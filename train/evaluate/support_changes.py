@@ -1,12 +1,13 @@
 r"""What a policy knows of its local frame where the support foot changes, against the truth.
 
-The local frame of a walking controller stands at the sole of the support foot, where joint angles and IMU put it
-(section II.B of the paper). Where joints give way, it is off by the vector e; for a deflection δ of the hip roll joint
-alone (the paper's θ), with leg length L, that is Eq. 1:
+The local frame of a walking controller stands at the sole of the support foot, where joint angles
+and IMU put it (section II.B of the paper). Where joints give way, it is off by the vector e; for a
+deflection δ of the hip roll joint alone (the paper's θ), with leg length L, that is Eq. 1:
 
 .. math:: e = L \, [0, \; 2 \sin(δ/2) \cos(δ/2), \; 2 \sin²(δ/2)]
 
-Where the support foot changes, the frame is taken anew from the other foot, and the estimated center of mass jumps.
+Where the support foot changes, the frame is taken anew from the other foot, and the estimated
+center of mass jumps.
 
 Axes are level and have the heading of the pelvis, which no sensor of the robot shows.
 """
@@ -60,7 +61,8 @@ class SupportChanges:
     """
 
     def __init__(self, model: WalkerModel) -> None:
-        self._biped, self._support = model.biped, model.plan.timing.support
+        self._biped = model.biped
+        self._support = model.plan.timing.support
         self._changes = set(support_changes(model.plan.timing).tolist())
         self._attitude = model.observation_table.group("imu_attitude")
         self._errors: list[Array] = []
@@ -79,7 +81,8 @@ class SupportChanges:
             return
         estimate = local_frame(self._biped, q_estimate, observation[:, self._attitude])
         true = local_frame(self._biped, truth.q, tilt(truth.pelvis_R))
-        old, new = int(self._support[step - 1]), int(self._support[step])
+        old = int(self._support[step - 1])
+        new = int(self._support[step])
         self._errors.append(frame_error(estimate, true, new))
         self._jumps.append(com_jump(estimate, self._biped.footholds, old, new))
 

@@ -20,7 +20,7 @@ from elastic_env.core.files import write_whole
 from train.cells.play import run_conditions
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a

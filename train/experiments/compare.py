@@ -14,21 +14,22 @@ from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, lo
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shown
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
-from train.evaluate.changes import changes, merged
+from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import Environment, Reference, environment
-from train.evaluate.evaluate import Evaluation, make_policy, with_one_world
+from train.evaluate.episodes import Evaluation
 from train.evaluate.families import expand
-from train.evaluate.leaderboard import standings
 from train.evaluate.maps import MapConfig, heat_maps
 from train.evaluate.robots import robot_scores
+from train.evaluate.rollout import make_policy, single_world_envs
+from train.evaluate.standings import standings
 from train.experiments.timing import step_times
 from train.figures import plots
-from train.figures.figures import draw_figures, draw_maps
+from train.figures.comparison_figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
-from train.report.changes_tables import print_changes, write_maps, write_statistics
+from train.report.change_tables import print_changes, write_maps, write_statistics
 from train.report.leaderboard import print_leaderboard, write_leaderboard
-from train.report.robots_tables import print_robots, write_robots
+from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import describe, locked, require_run, run_folder
 from train.runs.kinds import is_a
@@ -269,7 +270,7 @@ def compare(
         robots = robot_scores(evaluations)
         if robots:
             files.append(write_robots(robots, folder / "robots.csv"))
-        cells = merged(evaluations)
+        cells = merge_seeds(evaluations)
         files.append(write_summary(cells, folder / "summary.md"))
         axis = None if config.sweep is None else config.sweep.label or config.sweep.option
         maps = [] if config.map is None else heat_maps(evaluations, config.map)
@@ -339,7 +340,7 @@ def _played(
         return run_conditions(conditions, console, work.place, store, work.fresh)
     except CellsFailedError as error:
         if error.finished:
-            write_summary(merged(error.finished), folder / "summary.md")
+            write_summary(merge_seeds(error.finished), folder / "summary.md")
             kept = write_episodes(error.finished, folder / "episodes.csv")
             console.print(f"the other {len(error.finished)} cells are in {kept} and summary.md", soft_wrap=True)
         raise
@@ -357,7 +358,7 @@ def _require_each_once(what: str, values: Sequence[object]) -> None:
 
 def try_out(conditions: Sequence[Condition]) -> None:
     """Make environments and policies once, so that a wrong name fails before anything runs."""
-    for condition, env in with_one_world(_each_once(conditions)):
+    for condition, env in single_world_envs(_each_once(conditions)):
         try:
             policy = make_policy(condition.policy, env, condition.policy_options)
         except ConfigurationError as error:

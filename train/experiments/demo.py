@@ -12,11 +12,12 @@ import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import make_gravity
 from train.cells.play import run_conditions
 from train.evaluate.conditions import PolicySpec
-from train.evaluate.evaluate import Evaluation, make_vector_env
+from train.evaluate.episodes import Evaluation
+from train.evaluate.rollout import make_vector_env
 from train.experiments.compare import CompareConfig
 from train.figures import plots
-from train.figures.figures import cells, draw_figure
-from train.figures.testbed_plots import draw_identification, draw_static_errors, draw_time_series, static_errors
+from train.figures.comparison_figures import cells_together, draw_figure, draw_time_series
+from train.figures.testbed_plots import draw_identification, draw_static_errors, static_errors
 from train.report.summary import print_summary, write_episodes, write_summary
 from train.runs.folders import run_folder
 
@@ -83,7 +84,12 @@ def demo(console: Console, output: Path | None = None) -> None:
             draw_identification(result, points, [model], folder / "fig5_identification.png"),
             draw_static_errors(static, model, folder / "fig6_static_errors.png"),
             draw_time_series(motion, folder / "sine.png"),
-            *(file for name in ("pelvis", "zmp") for walk in cells(walks) for file in draw_figure(name, walk, folder)),
+            *(
+                file
+                for name in ("pelvis", "zmp")
+                for walk in cells_together(walks)
+                for file in draw_figure(name, walk, folder)
+            ),
             folder / "identification.json",
             write_episodes([*motion, *walks], folder / "episodes.csv"),
             write_summary([*motion, *walks], folder / "summary.md"),

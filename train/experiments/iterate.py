@@ -21,9 +21,9 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.runtime.robot_model import WalkerModel
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import Column, environment
-from train.evaluate.evaluate import make_policy, make_vector_env
+from train.evaluate.rollout import make_policy, make_vector_env
 from train.figures import plots
-from train.figures.learning_plots import draw_trials
+from train.figures.chart import trials_chart
 from train.runs.escaping import write_records
 from train.runs.folders import provenance, run_folder
 from train.runs.progress import show_progress
@@ -87,9 +87,10 @@ def iterate(config: IterateConfig, console: Console, output: Path | None = None)
         with run_folder("iterate", config.model_dump(mode="json"), config.seed, output) as folder:
             trials = _trials(config, env, policy, console)
             columns = config.condition.environment.judged
+            chart = trials_chart(trials, columns, f"Learned on the robot, {config.scenario}")
             files = [
                 _write_trials(trials, policy, config, folder / "trials.csv"),
-                draw_trials(trials, columns, config.condition, folder / "trials.png"),
+                plots.draw_chart(chart, folder / "trials.png"),
             ]
             policies = _save(config, env, policy, folder)
     console.print(trials_table(trials, columns, config))

@@ -4,17 +4,17 @@ import io
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 from rich.console import Console
 from rich.progress import track
 
 from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra, shortened
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import blamed, make_policy, make_vector_env
+from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
 
@@ -85,19 +85,10 @@ def episode(
         steps: Number of steps at most.
         console: Where messages go.
     """
-    observation, _ = env.reset(seed=condition.seed)
-    state, start = None, np.array(True)
-    for step in range(steps):
-        with blamed(condition, step):
-            action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
-            observation, _, terminated, truncated, info = env.step(action)
-        start = np.array(False)
-        yield step, info
-        if terminated:
-            console.print(f"the episode ended after {info['time_s']:.2f} s: {info['termination']}")
-            return
-        if truncated:
-            return
+    for step in islice(control_steps(env, policy, condition.seed, condition), steps):
+        yield step.number, step.info
+        if step.terminated:
+            console.print(f"the episode ended after {step.info['time_s']:.2f} s: {step.info['termination']}")
 
 
 def _window(episode: Iterator[int], period: float) -> None:

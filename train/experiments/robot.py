@@ -29,7 +29,7 @@ from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, ga
 from elastic_env.robots.robot.environment import RobotConfig, configure_robot
 from elastic_env.runtime.joint_task import JointPlant
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.experiments.compare import CompareConfig, compare
 from train.experiments.play import play

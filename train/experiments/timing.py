@@ -3,12 +3,11 @@
 import statistics
 import time
 from collections.abc import Sequence
+from itertools import islice
 from typing import Any
 
-import numpy as np
-
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import make_policy, make_vector_env
+from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _STEPS, _ROUNDS = 50, 15
 """Control steps per round: whole decisions of residuals, which take 25; rounds, of which the median counts."""
@@ -44,27 +43,27 @@ def step_times(conditions: Sequence[Condition], steps: int = _STEPS, rounds: int
 
 
 class _Player:
-    """A policy in an environment of one world."""
+    """A policy in an environment of one world; it measures itself."""
 
     def __init__(self, condition: Condition) -> None:
         self._env = make_vector_env(condition, 1, num_threads=1)
         self._policy = make_policy(condition.policy, self._env, condition.policy_options)
-        self._observation, _ = self._env.reset(seed=condition.seed)
-        self._state: Any = None
-        self._start, self._done = np.ones(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
+        self._spent_s = 0.0
+        self._steps = control_steps(self._env, self, condition.seed)
+
+    def predict(self, *arguments: Any, **options: Any) -> tuple[Any, Any]:
+        """The command of the policy; its processor time is added up."""
+        begin = time.process_time()
+        found = self._policy.predict(*arguments, **options)
+        self._spent_s += time.process_time() - begin
+        return found
 
     def play(self, steps: int) -> float:
         """Play control steps; the time that the policy alone took [s]."""
-        spent_s = 0.0
-        for _ in range(steps):
-            begin = time.process_time()
-            action, self._state = self._policy.predict(
-                self._observation, state=self._state, episode_start=self._start, deterministic=True
-            )
-            spent_s += time.process_time() - begin
-            self._observation, _, terminated, truncated, _ = self._env.step(action)
-            self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
-        return spent_s
+        before = self._spent_s
+        for _ in islice(self._steps, steps):
+            pass
+        return self._spent_s - before
 
     def close(self) -> None:
         """End the environment."""

@@ -23,7 +23,7 @@ from rich.console import Console
 from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import make_policy
+from train.evaluate.rollout import make_policy
 from train.experiments.play import episode, steps_within
 from train.experiments.view_proxy import LOOPBACK, Access, Proxy, listen
 

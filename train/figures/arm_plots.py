@@ -15,13 +15,15 @@ _COLUMNS = 4
 _LEAST_LEVER = 0.1  # of the largest: poses that show a joint less are left out of its panel
 _LEAST_SEEN = 0.01  # of the largest of all joints
 _MOST_NAMED = 3  # columns of a measurement that a legend names
-_DOTS, _LINE = "#2a6f97", "#888888"
+_DOTS = "#2a6f97"
+_LINE = "#888888"
 
 
 def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
     """A panel per joint with measured against predicted deflection, and one with the residual of every pose.
 
-    Measured is the predicted deflection and the part of the residual that a deflection of this joint alone explains.
+    Measured is the predicted deflection and the part of the residual that a deflection of this
+    joint alone explains.
     """
     plt = require_matplotlib()
     rows = -(-(len(result.joints) + 1) // _COLUMNS)
@@ -42,10 +44,12 @@ def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) 
 
 def deflections(fit: ArmFit) -> tuple[Array, Array]:
     """Deflections of the elastic joints, predicted and measured, (N, k) [rad]; nan where a pose does not show one."""
-    model, elastic = fit.model, fit.model.unknowns.elastic
+    model = fit.model
+    elastic = fit.model.unknowns.elastic
     compliance, _ = fit.estimate("compliance")
     predicted = compliance * model.torque(fit.unknowns, fit.q)[:, elastic]
-    # an offset turns a joint as a deflection does, so that its derivative is the lever of the deflection
+    # an offset turns a joint as a deflection does, so that its derivative is the lever of the
+    # deflection
     lever = model.predicted(fit.unknowns)[1][..., model.unknowns.slices["offset"]]
     size = np.sum(lever**2, axis=1)
     largest = size.max(axis=0)
@@ -56,7 +60,14 @@ def deflections(fit: ArmFit) -> tuple[Array, Array]:
 
 def _draw_joint(axis: Any, predicted: Array, measured: Array) -> None:
     if np.isnan(measured).all():
-        axis.text(0.5, 0.5, "the measurement\ndoes not show it", ha="center", transform=axis.transAxes, fontsize=9)
+        axis.text(
+            0.5,
+            0.5,
+            "the measurement\ndoes not show it",
+            ha="center",
+            transform=axis.transAxes,
+            fontsize=9,
+        )
         return
     axis.axline((0.0, 0.0), slope=1.0, color=_LINE, lw=0.9)
     axis.scatter(MRAD * predicted, MRAD * measured, s=14, color=_DOTS, alpha=0.8, linewidths=0, zorder=3)

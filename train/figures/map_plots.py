@@ -12,11 +12,15 @@ import numpy as np
 from train.evaluate.changes import BEST_ANALYTIC, SIGNS, Change, percent
 from train.evaluate.environments import Column
 from train.evaluate.maps import HeatMap, MapCell
-from train.figures.plots import colours, require_matplotlib, save
+from train.figures.colours import INK, policy_colours
+from train.figures.plots import require_matplotlib, save
 
-INK = "#1f2328"
-_AHEAD, _BEHIND, _SCORE, _EMPTY = "#1a7f5a", "#b42318", "#2a6f97", "#f1f3f5"
-_STRONGEST, _STRONGEST_CHANGE = 0.75, 1.0
+_AHEAD = "#1a7f5a"
+_BEHIND = "#b42318"
+_SCORE = "#2a6f97"
+_EMPTY = "#f1f3f5"
+_STRONGEST = 0.75
+_STRONGEST_CHANGE = 1.0
 """Share of a colour in the strongest square, and the change from which on it has that share."""
 _BEST_SHARE = 0.32
 """Share of a policy's colour in a square that it wins."""
@@ -68,21 +72,38 @@ class Panel:
 
 def panels(heat_map: HeatMap) -> list[Panel]:
     """Who is best, every residual against the best policy without learning, and the score of every policy."""
-    column, shades = heat_map.column, colours(heat_map.policies)
+    column = heat_map.column
+    shades = policy_colours(heat_map.policies)
     letters = dict(zip(heat_map.policies, ascii_uppercase, strict=False))  # a map with more would not be readable
     key = tuple((letters.get(title, "?"), title, shades[title]) for title in heat_map.policies)
     many = len({cell.best_analytic for cell in heat_map.flat} - {None}) > 1
     found = [
-        _panel(heat_map, f"Best policy, and its {column.label}", lambda c: _best(c, column, letters, shades), key=key)
+        _panel(
+            heat_map,
+            f"Best policy, and its {column.label}",
+            lambda c: _best(c, column, letters, shades),
+            key=key,
+        )
     ]
     for title in heat_map.families:
         what = f"{title} against the {BEST_ANALYTIC}, change of {column.title} [%]"
-        found.append(_panel(heat_map, what, lambda c, t=title: _learned(c.learned.get(t), letters if many else {})))
+        found.append(
+            _panel(
+                heat_map,
+                what,
+                lambda c, t=title: _learned(c.learned.get(t), letters if many else {}),
+            )
+        )
     levels = [e.value for cell in heat_map.flat for e in cell.levels.values() if np.isfinite(e.value) and e.value > 0.0]
     ends = (min(levels), max(levels)) if levels else (1.0, 1.0)
     for title in heat_map.policies:
         found.append(
-            _panel(heat_map, f"{title}, {column.label}", lambda c, t=title: _level(c, t, column, ends), is_main=False)
+            _panel(
+                heat_map,
+                f"{title}, {column.label}",
+                lambda c, t=title: _level(c, t, column, ends),
+                is_main=False,
+            )
         )
     return found
 
@@ -91,7 +112,8 @@ def draw_map(heat_map: HeatMap, path: Path) -> Path:
     """Draw the main panels of a map, one below the other, in a width that a telephone shows."""
     plt = require_matplotlib()
     shown = [panel for panel in panels(heat_map) if panel.is_main]
-    columns, rows = len(heat_map.x.values), len(heat_map.y.values)
+    columns = len(heat_map.x.values)
+    rows = len(heat_map.y.values)
     size = max(0.72 * columns + 0.9, 4.4), (0.5 * rows + 1.25) * len(shown) + 0.35
     figure, axes = plt.subplots(len(shown), 1, figsize=size, squeeze=False, layout="constrained")
     for axis, panel in zip(axes[:, 0], shown, strict=True):
@@ -102,18 +124,25 @@ def draw_map(heat_map: HeatMap, path: Path) -> Path:
 
 def _panel(heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], **more: Any) -> Panel:
     return Panel(
-        title=title, x_label=heat_map.x.title, y_label=heat_map.y.title,
-        x_ticks=tuple(heat_map.x.ticks(heat_map.known)), y_ticks=tuple(heat_map.y.ticks(heat_map.known)),
-        squares=tuple(tuple(map(square, row)) for row in heat_map.cells), **more,
-    )  # fmt: skip
+        title=title,
+        x_label=heat_map.x.title,
+        y_label=heat_map.y.title,
+        x_ticks=tuple(heat_map.x.ticks(heat_map.known)),
+        y_ticks=tuple(heat_map.y.ticks(heat_map.known)),
+        squares=tuple(tuple(map(square, row)) for row in heat_map.cells),
+        **more,
+    )
 
 
 def _best(cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]) -> Square:
     if cell.best is None:
         return Square("-", "", _EMPTY)
     value = f"{column.scale * cell.levels[cell.best].value:.{_decimals(column)}f}"
-    return Square(letters.get(cell.best, "?"), f"{value}{_falls(cell.failed[cell.best])}",
-                  blended(shades[cell.best], _BEST_SHARE))  # fmt: skip
+    return Square(
+        letters.get(cell.best, "?"),
+        f"{value}{_falls(cell.failed[cell.best])}",
+        blended(shades[cell.best], _BEST_SHARE),
+    )
 
 
 def _learned(change: Change | None, letters: Mapping[str, str]) -> Square:
@@ -124,8 +153,11 @@ def _learned(change: Change | None, letters: Mapping[str, str]) -> Square:
     share = _STRONGEST * min(abs(value) / _STRONGEST_CHANGE, 1.0)
     small = f"to {letters[change.base]}" if change.base in letters else ""
     falls = f" ✕{change.falls}/{change.episodes}" if change.falls_more else ""
-    return Square(percent(value).removesuffix(" %") + SIGNS.get(change.verdict, ""), f"{small}{falls}".strip(),
-                  blended(_AHEAD if value < 0.0 else _BEHIND, share))  # fmt: skip
+    return Square(
+        percent(value).removesuffix(" %") + SIGNS.get(change.verdict, ""),
+        f"{small}{falls}".strip(),
+        blended(_AHEAD if value < 0.0 else _BEHIND, share),
+    )
 
 
 def _level(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
@@ -134,8 +166,11 @@ def _level(cell: MapCell, title: str, column: Column, ends: tuple[float, float])
     value = cell.levels[title].value
     low, high = map(math.log, ends)
     share = (math.log(max(value, ends[0])) - low) / (high - low) if high > low else 0.0
-    return Square(f"{column.scale * value:.{_decimals(column)}f}", _falls(cell.failed[title]).strip(),
-                  blended(_SCORE, 0.06 + (_STRONGEST - 0.06) * share))  # fmt: skip
+    return Square(
+        f"{column.scale * value:.{_decimals(column)}f}",
+        _falls(cell.failed[title]).strip(),
+        blended(_SCORE, 0.06 + (_STRONGEST - 0.06) * share),
+    )
 
 
 def _falls(failed: tuple[int, int]) -> str:
@@ -179,8 +214,15 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
         axis.spines[side].set_visible(False)
     if panel.key:
         text = "   ".join(f"{letter} {title}" for letter, title, _ in panel.key)
-        axis.annotate(_wrapped(text, 60), (0.0, 0.0), (0, -34), xycoords="axes fraction", textcoords="offset points",
-                      fontsize=8, va="top")  # fmt: skip
+        axis.annotate(
+            _wrapped(text, 60),
+            (0.0, 0.0),
+            (0, -34),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            fontsize=8,
+            va="top",
+        )
 
 
 def _wrapped(text: str, width: int = 52) -> str:
@@ -189,7 +231,7 @@ def _wrapped(text: str, width: int = 52) -> str:
     return "\n".join(textwrap.wrap(text, width))
 
 
-def in_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
+def panel_rows(panel: Panel) -> tuple[list[str], list[list[str]]]:
     """Head and rows of a panel as a table, the greatest y first."""
     rows: Sequence[tuple[str, Sequence[Square]]] = list(zip(panel.y_ticks, panel.squares, strict=True))[::-1]
     head = [f"{panel.y_label} \\ {panel.x_label}", *panel.x_ticks]

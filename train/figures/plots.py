@@ -1,4 +1,4 @@
-"""What all figures share: style, colours, files; and the bar chart of a whole comparison."""
+"""Charts as pictures, by Matplotlib: style, files, curves, and the bar chart of a whole comparison."""
 
 import io
 from collections.abc import Sequence
@@ -10,29 +10,13 @@ import numpy as np
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
+from train.evaluate.episodes import Evaluation
+from train.figures.chart import Chart, Curve
+from train.figures.colours import FAILED, policy_colours
 
-MRAD, MM = 1e3, 1e3
+MRAD = 1e3
+MM = 1e3
 """Factors from rad and m to what figures show."""
-
-COLOURS = {
-    "zero": "#9c6644",
-    "rigid": "#555555",
-    "uncompensated_open": "#e6a57e",
-    "uncompensated": "#c8553d",
-    "input_open": "#8fbbd9",
-    "input": "#2a6f97",
-    "input_output": "#14a098",
-    "input_wrench": "#1f2a55",
-    "dynamic": "#7aa344",
-    "oracle": "#8e5ea2",
-}
-"""Of the baselines."""
-STRONG = ("#d6006c", "#e69500", "#3d3df5", "#00a63e", "#111111", "#00a5cf", "#a05a00", "#8a8a8a")
-"""Of residuals and of one's own policies: far from the baselines' and from one another."""
-FAILED = "#111111"
-"""Colour of the mark of a failure that belongs to no policy alone."""
-_DASHED = ("zero", "rigid", "uncompensated_open", "input_open")
 
 
 def require_matplotlib() -> Any:
@@ -66,17 +50,6 @@ def require_matplotlib() -> Any:
     return plt
 
 
-def colours(policies: Sequence[str]) -> dict[str, str]:
-    """A colour for every policy of a comparison: those that have none of their own take the others in turn."""
-    unnamed = [policy for policy in policies if policy not in COLOURS]
-    return {policy: COLOURS.get(policy) or STRONG[unnamed.index(policy) % len(STRONG)] for policy in policies}
-
-
-def line_style(policy: str) -> str:
-    """Line of a policy: dashed where no center of mass is fed back."""
-    return "--" if policy in _DASHED else "-"
-
-
 def columns_of(entries: int, widest: int = 5) -> int:
     """Columns of a legend, so that its rows are about equally full."""
     rows = -(-entries // widest)
@@ -92,10 +65,106 @@ def save(figure: Any, path: Path) -> Path:
     return path
 
 
+def draw_chart(chart: Chart, path: Path) -> Path:
+    """Draw the panels of a chart one below the other, with a legend below.
+
+    A filled cross on top stands where all episodes of a policy failed, an open one where some did.
+    """
+    plt = require_matplotlib()
+    rows = [0.16 * len(chart.failing) + 0.2] if chart.failing else []
+    figure, axes = plt.subplots(
+        len(rows) + len(chart.panels),
+        1,
+        figsize=(chart.width, chart.height),
+        sharex=True,
+        squeeze=False,
+        height_ratios=[*rows, *(panel.height for panel in chart.panels)],
+        layout="constrained",
+    )
+    axes = list(axes[:, 0])
+    if chart.failing:
+        _draw_failing(axes[0], chart)
+    for axis, panel in zip(axes[len(rows) :], chart.panels, strict=True):
+        for begin, end in chart.shaded:
+            axis.axvspan(begin, end, color="#e9ebee", lw=0, zorder=0, label=chart.shade_name)
+        for curve in panel.curves:
+            _draw_curve(axis, curve, panel.limits)
+        axis.set_ylabel(panel.label)
+        axis.grid(axis="x", visible=chart.ticks is not None)
+        if panel.is_log:
+            axis.set_yscale("log")
+            _show_numbers(axis.yaxis)
+        if panel.limits is not None:
+            axis.set_ylim(*panel.limits)
+            if panel.limits[0] < 0.0 < panel.limits[1]:
+                axis.axhline(0.0, color="#777777", lw=0.8, zorder=1)
+        if chart.ticks is None:
+            axis.margins(x=0.0)
+    if chart.ticks is not None:
+        axes[-1].set_xscale("log")
+        axes[-1].set_xticks(chart.ticks, [f"{value:g}" for value in chart.ticks])
+        axes[-1].minorticks_off()
+    axes[0].set_title(chart.title)
+    axes[-1].set_xlabel(chart.label)
+    if any(curve.fails for panel in chart.panels for curve in panel.curves):
+        axes[-1].scatter([], [], marker="X", s=60, color=FAILED, label="fall")
+    handles, labels = axes[-1].get_legend_handles_labels()
+    once = dict(zip(labels, handles, strict=True))
+    if chart.shade_name in once:  # behind the curves
+        once[chart.shade_name] = once.pop(chart.shade_name)
+    figure.align_ylabels(axes)
+    figure.legend(once.values(), once.keys(), ncols=columns_of(len(once)), loc="outside lower center")
+    return save(figure, path)
+
+
+def _draw_curve(axis: Any, curve: Curve, limits: tuple[float, float] | None) -> None:
+    style = {"solid": "-", "dash": "--", "dot": ":"}[curve.dash]
+    marker = {"marker": "o", "ms": 4} if curve.has_points else {}
+    name = curve.name or "_"  # without a name Matplotlib has it in no legend
+    axis.plot(curve.x, curve.y, color=curve.colour, lw=curve.width, ls=style, label=name, **marker)
+    if curve.band is not None:
+        axis.fill_between(curve.x, *curve.band, color=curve.colour, alpha=0.18, lw=0)
+    if curve.fails:
+        last = curve.y[np.isfinite(curve.y)][-1:]
+        y = last if limits is None else np.clip(last, *limits)
+        style = {
+            "marker": "X",
+            "s": 70,
+            "edgecolors": "white",
+            "lw": 0.8,
+            "zorder": 6,
+            "clip_on": False,
+        }
+        axis.scatter(curve.x[-1:], y, color=curve.colour, **style)
+
+
+def _draw_failing(axis: Any, chart: Chart) -> None:
+    """A row of crosses per policy that fails somewhere."""
+    for row, policy in enumerate(reversed(chart.failing)):
+        faces = [policy.colour if is_all else "none" for is_all in policy.is_all]
+        places = np.full(len(policy.x), row)
+        axis.scatter(policy.x, places, marker="X", s=46, facecolors=faces, edgecolors=policy.colour, lw=1.0)
+    axis.set_yticks(range(len(chart.failing)), [policy.name for policy in reversed(chart.failing)], fontsize=8)
+    axis.set_ylim(-0.7, len(chart.failing) - 0.3)
+    axis.set_ylabel(chart.failure)
+    axis.tick_params(axis="x", length=0)
+    axis.grid(axis="y", visible=False)
+
+
+def _show_numbers(axis: Any) -> None:
+    """Numbers instead of powers of ten on a logarithmic axis."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
     """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel with all references.
 
-    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that failed.
+    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
+    failed.
     """
     plt = require_matplotlib()
     known = evaluations[0].condition.environment
@@ -103,7 +172,8 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     scenarios = list(dict.fromkeys(e.condition.scenario for e in evaluations))
     panels: dict[str, dict[str, list[Evaluation]]] = {}
     for evaluation in evaluations:
-        reference, scenario = evaluation.condition.reference_name, evaluation.condition.scenario
+        reference = evaluation.condition.reference_name
+        scenario = evaluation.condition.scenario
         outer, inner = (
             (f"scenario {scenario}", reference) if len(scenarios) == 1 else (known.title(reference), scenario)
         )
@@ -112,9 +182,14 @@ def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path)
     stacked = len(panels) > 1 and width * len(panels) > _WIDEST
     rows, columns = (len(panels), 1) if stacked else (1, len(panels))
     figure, axes = plt.subplots(
-        rows, columns, figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
-        sharey=True, sharex=stacked, squeeze=False, layout="constrained",
-    )  # fmt: skip
+        rows,
+        columns,
+        figsize=(min(width, 1.4 * _WIDEST) * columns, (2.3 if stacked else 3.8) * rows),
+        sharey=True,
+        sharex=stacked,
+        squeeze=False,
+        layout="constrained",
+    )
     for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
         _draw_bars(axis, groups, column, policies)
         axis.set_title(title)
@@ -134,7 +209,8 @@ _ROOMY = 7
 
 def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, policies: Sequence[str]) -> None:
     """A bar per policy in every group."""
-    width, shades = 0.84 / len(policies), colours(policies)
+    width = 0.84 / len(policies)
+    shades = policy_colours(policies)
     for place, evaluation in ((place, e) for place, group in enumerate(groups.values()) for e in group):
         policy = evaluation.condition.policy.title
         index = policies.index(policy)
@@ -160,7 +236,7 @@ def _draw_bars(axis: Any, groups: dict[str, list[Evaluation]], column: Column, p
 
 def _legend(figure: Any, axis: Any, evaluations: Sequence[Evaluation], policies: Sequence[str], per_row: int) -> None:
     """Policies, and the mark of failures if there are any."""
-    handles = [axis.bar(np.nan, 0.0, color=shade, label=policy) for policy, shade in colours(policies).items()]
+    handles = [axis.bar(np.nan, 0.0, color=shade, label=policy) for policy, shade in policy_colours(policies).items()]
     if any(evaluation.num_failed for evaluation in evaluations):
         failure = evaluations[0].condition.environment.failure
         handles.append(axis.scatter([], [], marker="X", s=26, color=FAILED, label=failure))

@@ -10,8 +10,9 @@ from baselines.identification.identify import Identification
 from baselines.identification.static_points import StaticPoints, link_torque
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import RobotModel
-from train.evaluate.evaluate import Evaluation
-from train.figures.plots import MRAD, colours, require_matplotlib, save
+from train.evaluate.episodes import Evaluation
+from train.figures.colours import policy_colours
+from train.figures.plots import MRAD, require_matplotlib, save
 
 _PAPER_RANGES_MRAD = {"uncompensated": (-56.2, 41.7), "input": (-3.7, 7.1)}
 """Fig. 6 of the paper."""
@@ -29,7 +30,13 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
         (-1, "v", "none", "approached from above"),
     ):
         chosen = points.direction == direction
-        style = {"marker": marker, "s": 34, "facecolors": face, "edgecolors": "#2a6f97", "linewidths": 1.2}
+        style = {
+            "marker": marker,
+            "s": 34,
+            "facecolors": face,
+            "edgecolors": "#2a6f97",
+            "linewidths": 1.2,
+        }
         top.scatter(torque[chosen], MRAD * deflection[chosen], label=label, zorder=3, **style)
         fitted = _fitted(result, line, direction)
         top.plot(line, MRAD * fitted, color="#2a6f97", lw=0.9, ls="-" if direction > 0 else "--")
@@ -48,11 +55,14 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
     )
     top.set_title(f"K = {result.stiffness_nm_per_rad:.1f} N·m/rad, 95 % interval {_interval(result)}")
     top.text(
-        0.03, 0.95,
+        0.03,
+        0.95,
         f"friction {result.friction_nm:.2f} N·m\ndead band {MRAD * result.dead_band_rad:.2f} mrad\n"
         f"offset {MRAD * result.offset_rad:+.2f} mrad\nPearson r {result.pearson_r:.4f}",
-        transform=top.transAxes, va="top", fontsize=9,
-    )  # fmt: skip
+        transform=top.transAxes,
+        va="top",
+        fontsize=9,
+    )
     top.set_ylabel("deflection θ − q [mrad]")
     top.legend(loc="lower right")
     bottom.axhline(0.0, color="#888888", lw=0.8)
@@ -65,20 +75,30 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     """Link error at the static positions, with and without compensation, as Fig. 6 of the paper."""
     plt = require_matplotlib()
     figure, axis = plt.subplots(figsize=(7.6, 4.4))
-    gravity, shades = [make_gravity(model)], _shades(evaluations)
+    gravity = [make_gravity(model)]
+    shades = policy_colours([e.condition.policy.title for e in evaluations])
     for index, evaluation in enumerate(evaluations):
-        policy, points = evaluation.condition.policy.title, evaluation.points
+        policy = evaluation.condition.policy.title
+        points = evaluation.points
         if points is None:
             continue
         error = MRAD * static_errors(evaluation)
-        marker, face = "xosDv^"[index % 6], None if index == 0 else "none"
+        marker = "xosDv^"[index % 6]
+        face = None if index == 0 else "none"
         shade = shades[policy]
         style = {"facecolors": face, "edgecolors": shade} if face else {"color": shade}
-        low, high = error.min(), error.max()
+        low = error.min()
+        high = error.max()
         axis.scatter(
-            link_torque(points, gravity, points.q), error, marker=marker, s=34, linewidths=1.3, zorder=3,
-            label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}", **style,
-        )  # fmt: skip
+            link_torque(points, gravity, points.q),
+            error,
+            marker=marker,
+            s=34,
+            linewidths=1.3,
+            zorder=3,
+            label=f"{policy}: {low:+.1f} to {high:+.1f} mrad{_paper(policy)}",
+            **style,
+        )
         axis.axhspan(low, high, color=shade, alpha=0.08, lw=0)
         for bound in _PAPER_RANGES_MRAD.get(policy, ()):
             axis.axhline(bound, color=shade, lw=0.9, ls=":")
@@ -89,38 +109,12 @@ def draw_static_errors(evaluations: Sequence[Evaluation], model: RobotModel, pat
     return save(figure, path)
 
 
-def _shades(evaluations: Sequence[Evaluation]) -> dict[str, str]:
-    return colours([evaluation.condition.policy.title for evaluation in evaluations])
-
-
 def static_errors(evaluation: Evaluation) -> Array:
     """Link error by the IMU, averaged over each window at rest of the first episode, (visits,) [rad]."""
     points = evaluation.points
     assert points is not None
     references = evaluation.rest_references
     return references - points.q
-
-
-def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
-    """Reference and link error over time, one line per policy."""
-    plt = require_matplotlib()
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(8.0, 5.0), sharex=True, height_ratios=(1, 2))
-    first = evaluations[0]
-    top.plot(first.trace["time_s"], first.trace["reference_angle"], color="#333333", lw=1.2)
-    top.set_ylabel("q_ref [rad]")
-    top.set_title(f"{first.condition.reference_name}, scenario {first.condition.scenario}")
-    shades = _shades(evaluations)
-    for evaluation in evaluations:
-        policy = evaluation.condition.policy.title
-        bottom.plot(
-            evaluation.trace["time_s"], MRAD * evaluation.trace["link_error"], lw=1.1,
-            color=shades[policy], label=policy,
-        )  # fmt: skip
-    bottom.axhline(0.0, color="#888888", lw=0.8)
-    bottom.set_ylabel("link error q_ref − q [mrad]")
-    bottom.set_xlabel("time [s]")
-    bottom.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2))
-    return save(figure, path)
 
 
 def _fitted(result: Identification, torque: Array, direction: int) -> Array:

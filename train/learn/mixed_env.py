@@ -17,7 +17,7 @@ from elastic_env.runtime.envs import reset_mask
 from elastic_env.runtime.robot_model import RobotModel
 from elastic_env.runtime.task import Task
 from train.evaluate.conditions import Condition
-from train.evaluate.evaluate import in_common, make_shared_env
+from train.evaluate.rollout import make_shared_env, shared_settings
 
 
 class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -150,7 +150,8 @@ def mixed_env(
     Raises:
         ConfigurationError: A name or an option that does not exist.
     """
-    shares = [list(share) for _, share in groupby(zip(conditions, sizes, strict=True), lambda own: in_common(own[0]))]
+    pairs = zip(conditions, sizes, strict=True)
+    shares = [list(share) for _, share in groupby(pairs, lambda own: shared_settings(own[0]))]
     threads = threads_of_each(_cores(num_threads), len(shares))
     envs = [
         make_shared_env([condition for condition, size in share for _ in range(size)], own, AutoresetMode.DISABLED)

@@ -16,8 +16,8 @@ from elastic_env.core.files import read_bounded, write_whole
 from elastic_env.core.signals import Array, BoolArray
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import make_policy
 from train.evaluate.progress import MOST_BYTES, PROGRESS
+from train.evaluate.rollout import control_steps, make_policy
 from train.learn.mixed_env import mixed_env
 from train.learn.train_config import TrainConfig
 from train.runs.folders import provenance
@@ -155,18 +155,17 @@ def played_together(
     with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
         policy = make_policy(conditions[0].policy, worlds)
         seeds = [condition.seed + episode for condition in conditions for episode in range(condition.episodes)]
-        values, failed = np.full((len(seeds), len(metrics)), np.nan), np.zeros(len(seeds), dtype=np.bool_)
-        observation, _ = worlds.reset(seed=seeds)
-        state, starting, playing = None, np.ones_like(failed), np.ones_like(failed)
-        while playing.any():
-            action, state = policy.predict(observation, state=state, episode_start=starting, deterministic=True)
-            observation, _, terminated, truncated, info = worlds.step(action)
-            starting = terminated | truncated
-            if starting.any():
-                scores = np.stack([info["episode_metrics"][name] for name in metrics], axis=1)
-                first = playing & starting
-                values[first], failed[first] = scores[first], terminated[first]
-                playing &= ~starting
-                observation, _ = worlds.reset(options={"reset_mask": starting})
+        values = np.full((len(seeds), len(metrics)), np.nan)
+        failed = np.zeros(len(seeds), dtype=np.bool_)
+        playing = np.ones_like(failed)
+        for step in control_steps(worlds, policy, seeds):
+            first = playing & step.is_over
+            if first.any():
+                scores = np.stack([step.info["episode_metrics"][name] for name in metrics], axis=1)
+                values[first] = scores[first]
+                failed[first] = step.terminated[first]
+                playing &= ~first
+            if not playing.any():
+                break
     parts = np.cumsum(sizes)[:-1]
     return list(zip(np.split(values, parts), np.split(failed, parts), strict=True))

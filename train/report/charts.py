@@ -1,180 +1,241 @@
-"""Charts of scores and of their changes: the ladder of policies, and every residual against its base."""
+"""Charts of scores and of their changes on a page: the ladder of policies, and every residual against its base."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-import numpy as np
+import pandas as pd
 
-from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, level, percent_interval
+from train.evaluate.changes import CEILING, HELD_OUT, Change, by_line, percent_interval
 from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation
 from train.evaluate.statistics import Estimate
-from train.report.parts import (
-    INK,
-    LINE,
+from train.evaluate.table import EpisodeTable, failures, score
+from train.figures.colours import INK, LINE, VERDICTS
+from train.report.render import number_interval
+from train.report.specs import (
     LONGEST_NAME,
-    VERDICTS,
-    Chart,
-    Lines,
+    PageChart,
     Spec,
-    axis_of,
+    base_axis,
+    base_layout,
     digits,
     domain,
     error_bars,
-    layout_of,
-    note,
     nth,
-    number_interval,
-    round_numbers,
-    shortened,
+    shorten,
 )
 from train.runs.escaping import chart_text
 
 
-def ladder(lines: Lines, reference: str) -> Chart:
+@dataclass(frozen=True, eq=False)
+class _Rung:
+    """A policy in a scenario, and its place on the ladder."""
+
+    scenario: str
+    policy: str
+    rows: pd.DataFrame
+    place: float
+
+
+def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> PageChart:
     """Every policy in every scenario: its mean over the episodes that did not fail; of families with interval."""
-    columns = lines.environment.judged
-    rungs = [
-        (scenario, title, lines.cell(title, reference_name=reference, scenario=scenario))
-        for scenario in lines.scenarios
-        for title in lines.titles
-    ]
-    rungs = [rung for rung in rungs if rung[2]]
-    places, headings, y, previous = [], [], 0.0, ""
-    for scenario, _, _ in rungs:
-        if scenario != previous:
-            headings.append((y + (0.5 if previous else 0.0), scenario))
-            y += 1.5 if previous else 1.0
-            previous = scenario
-        places.append(y)
-        y += 1.0
+    rungs, headings, bottom = _rungs(table, reference)
+    columns = table.environment.judged
+    layout = base_layout(left=8 * min(max(map(len, table.policies)), LONGEST_NAME) + 24, top=34, bottom=10)
     data: list[Spec] = []
-    layout = layout_of(margin={"l": 8 * min(max(map(len, lines.titles)), LONGEST_NAME) + 24, "r": 10, "t": 34, "b": 10})
     for number, column in enumerate(columns):
-        estimates = [level(cell, column).scaled(column.scale) for _, _, cell in rungs]
-        axis, known = nth(number), [e for e in estimates if np.isfinite(e.value)]
-        low = min([e.value if e.low is None else e.low for e in known], default=1.0)
-        high = max([e.value if e.high is None else e.high for e in known], default=1.0)
-        low = max(low, high / 1e4, 1e-6)
-        room = math.log10(max(high / low, 1.3))
-        edge = [math.log10(low) - 0.04 * room - 0.02, math.log10(max(high, low)) + 0.34 * room + 0.1]
-        for title in lines.titles:
-            chosen = [i for i, rung in enumerate(rungs) if rung[1] == title]
-            symbol = "diamond" if title in lines.residuals else "circle"
-            data.append(_rungs(title, lines.colour[title], symbol, [places[i] for i in chosen],
-                               [estimates[i] for i in chosen], axis))  # fmt: skip
-            data.append(_values([places[i] for i in chosen], [estimates[i] for i in chosen],
-                                [rungs[i][2] for i in chosen], column, edge[0], axis))  # fmt: skip
-        layout[f"xaxis{axis}"] = axis_of(
-            type="log", range=edge, domain=domain(number, len(columns), 0.03), side="top", title=column.label,
-            tickvals=round_numbers(10 ** edge[0], 10 ** edge[1]), anchor="y",
-        )  # fmt: skip
-        layout[f"xaxis{axis}"]["ticktext"] = [f"{value:g}" for value in layout[f"xaxis{axis}"]["tickvals"]]
-    layout["yaxis"] = axis_of(
-        range=[y - 0.3, -0.7], tickvals=places, ticktext=[chart_text(shortened(r[1])) for r in rungs], showgrid=False
+        axis = nth(number)
+        levels = [score(rung.rows, column) for rung in rungs]
+        edge = _edges([level.scaled(column.scale) for level in levels if level.is_known])
+        for policy in table.policies:
+            own = [(rung, level) for rung, level in zip(rungs, levels, strict=True) if rung.policy == policy]
+            symbol = "diamond" if policy in table.members else "circle"
+            data.append(_points(own, column, colours[policy], symbol, axis))
+            data.append(_figures(own, column, edge[0], axis, table.environment.failure))
+        ticks = _round_numbers(10 ** edge[0], 10 ** edge[1])
+        layout[f"xaxis{axis}"] = base_axis(
+            column.label,
+            type="log",
+            range=edge,
+            domain=domain(number, len(columns), gap=0.03),
+            side="top",
+            tickvals=ticks,
+            ticktext=[f"{value:g}" for value in ticks],
+            anchor="y",
+        )
+    layout["yaxis"] = base_axis(
+        range=[bottom - 0.3, -0.7],
+        tickvals=[rung.place for rung in rungs],
+        ticktext=[chart_text(shorten(rung.policy)) for rung in rungs],
+        showgrid=False,
     )
-    layout["annotations"] = [
-        note(0.0, place, f"<b>{chart_text(scenario)}</b>", xref="paper", yref="y", xanchor="right", xshift=-8)
-        for place, scenario in headings
-    ]
-    layout["shapes"] = [
-        {"type": "line", "xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": place - 0.6, "y1": place - 0.6,
-         "line": {"color": LINE, "width": 1}}
-        for place, _ in headings[1:]
-    ]  # fmt: skip
+    layout["annotations"] = [_heading(scenario, place) for scenario, place in headings.items()]
+    layout["shapes"] = [_rule(place - 0.6) for place in list(headings.values())[1:]]
     layout["showlegend"] = False
     row = 24 if len(rungs) < 40 else 19
-    return Chart({"data": data, "layout": layout}, int(70 + row * (y + 1)))
+    return PageChart({"data": data, "layout": layout}, int(70 + row * (bottom + 1)))
 
 
-def forest(rows: Sequence[Change]) -> Chart:
+def _rungs(table: EpisodeTable, reference: str) -> tuple[list[_Rung], dict[str, float], float]:
+    """Rungs, places of the headings by scenario, and the place below all of them."""
+    rungs: list[_Rung] = []
+    headings: dict[str, float] = {}
+    place = 0.0
+    for scenario in table.scenarios:
+        for policy in table.policies:
+            cells = table.cells_of(policy, reference, scenario)
+            if cells and scenario not in headings:
+                headings[scenario] = place + (0.5 if headings else 0.0)
+                place = headings[scenario] + 1.0
+            if cells:
+                rungs.append(_Rung(scenario, policy, table.of(policy, *cells), place))
+                place += 1.0
+    return rungs, headings, place
+
+
+def _edges(levels: Sequence[Estimate]) -> list[float]:
+    """Ends of a logarithmic axis, with room for figures at its right."""
+    low = min([level.ends[0] for level in levels], default=1.0)
+    high = max([level.ends[1] for level in levels], default=1.0)
+    low = max(low, high / 1e4, 1e-6)
+    room = math.log10(max(high / low, 1.3))
+    return [math.log10(low) - 0.04 * room - 0.02, math.log10(max(high, low)) + 0.34 * room + 0.1]
+
+
+def _points(own: Sequence[tuple[_Rung, Estimate]], column: Column, colour: str, symbol: str, axis: str) -> Spec:
+    """Points of a policy with their intervals."""
+    known = [(rung, level.scaled(column.scale)) for rung, level in own if level.is_known]
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": chart_text(own[0][0].policy) if own else "",
+        "xaxis": f"x{axis}",
+        "x": [digits(level.value) for _, level in known],
+        "y": [rung.place for rung, _ in known],
+        "error_x": error_bars([level for _, level in known], colour),
+        "marker": {"size": 10, "color": colour, "symbol": symbol},
+        "hoverinfo": "x+name",
+    }
+
+
+def _figures(own: Sequence[tuple[_Rung, Estimate]], column: Column, left: float, axis: str, failure: str) -> Spec:
+    """Figures beside the points, with failures."""
+    x = []
+    texts = []
+    for rung, level in own:
+        failed, played = failures(rung.rows)
+        cross = f'  <b style="color:{VERDICTS["higher"]}">✕ {failure} {failed}/{played}</b>' if failed else ""
+        x.append(digits(column.scale * level.ends[1]) if level.is_known else 10 ** (left + 1e-3))
+        texts.append(f"  {number_interval(level, column)}{cross}" if level.is_known else cross)
+    places = [rung.place for rung, _ in own]
+    return {**_texts(x, places, texts, axis), "cliponaxis": False}
+
+
+def _texts(x: Sequence[float], y: Sequence[float], texts: Sequence[str], axis: str) -> Spec:
+    return {
+        "type": "scatter",
+        "mode": "text",
+        "x": list(x),
+        "y": list(y),
+        "text": list(texts),
+        "textposition": "middle right",
+        "textfont": {"size": 12, "color": INK},
+        "hoverinfo": "skip",
+        "showlegend": False,
+        "xaxis": f"x{axis}",
+    }
+
+
+def _heading(text: str, place: float) -> Spec:
+    where = {"x": 0.0, "y": place, "xref": "paper", "yref": "y", "xanchor": "right", "xshift": -8}
+    return {
+        **where,
+        "text": f"<b>{chart_text(text)}</b>",
+        "showarrow": False,
+        "font": {"size": 13, "color": INK},
+    }
+
+
+def _rule(place: float) -> Spec:
+    where = {"xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": place, "y1": place}
+    return {"type": "line", **where, "line": {"color": LINE, "width": 1}}
+
+
+def _round_numbers(low: float, high: float) -> list[float]:
+    """1, 2, 5, 10, ... between two bounds."""
+    exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [d * 10.0**e for e in exponents for d in (1, 2, 5) if low <= d * 10.0**e <= high]
+
+
+def forest(rows: Sequence[Change]) -> PageChart:
     """Changes of one residual against its base, in every cell, with intervals."""
     lines = by_line(rows)
     columns = list(dict.fromkeys(row.column for row in rows))
-    names = [_scope_of(line[0], len({row.reference for row in rows}) > 1) for line in lines]
-    data: list[Spec] = []
-    widest = max(len(name.replace("<b>", "").replace("</b>", "")) for name in names)
-    layout = layout_of(margin={"l": 7.4 * min(widest, 46) + 26, "r": 10, "t": 40, "b": 10})
+    several = len({row.reference for row in rows}) > 1
+    scopes = [f"{line[0].reference} · {line[0].scope}" if several else line[0].scope for line in lines]
+    layout = base_layout(left=7.4 * min(max(map(len, scopes)), 46) + 26, top=40, bottom=10)
     layout["showlegend"] = False
+    data: list[Spec] = []
     for number, column in enumerate(columns):
         axis = nth(number)
         shown = [next(row for row in line if row.column == column) for line in lines]
-        finite = [row for row in shown if np.isfinite(row.relative.value)]
-        ends = [100.0 * v for row in finite for v in (row.relative.value, row.relative.low, row.relative.high)
-                if v is not None]  # fmt: skip
-        low, high = min([*ends, 0.0]), max([*ends, 0.0])
+        known = [(place, row) for place, row in enumerate(shown) if row.relative.is_known]
+        ends = [100.0 * end for _, row in known for end in (row.relative.value, *row.relative.ends)]
+        low = min([*ends, 0.0])
+        high = max([*ends, 0.0])
         span = max(high - low, 1.0)
-        for verdict, words in _VERDICT_WORDS.items():
-            chosen = [(i, row) for i, row in enumerate(shown) if row in finite and row.verdict == verdict]
-            data.append(
-                {
-                    "type": "scatter", "mode": "markers", "name": words, "showlegend": False, "xaxis": f"x{axis}",
-                    "x": [digits(100.0 * row.relative.value) for _, row in chosen], "y": [i for i, _ in chosen],
-                    "error_x": error_bars([row.relative.scaled(100.0) for _, row in chosen], VERDICTS[verdict]),
-                    "marker": {"size": 9, "color": VERDICTS[verdict], "symbol": [_symbol(row) for _, row in chosen],
-                               "line": {"width": 1.6, "color": VERDICTS[verdict]}},
-                    "hoverinfo": "text", "hovertext": [chart_text(f"{row.scope}: {row.sentence}") for _, row in chosen],
-                }
-            )  # fmt: skip
-        data.append(
-            {
-                "type": "scatter", "mode": "text", "xaxis": f"x{axis}", "showlegend": False, "hoverinfo": "skip",
-                "x": [digits(100.0 * max(row.relative.value, row.relative.high or row.relative.value))
-                      if row in finite else 0.0 for row in shown],
-                "y": list(range(len(shown))), "textposition": "middle right", "textfont": {"size": 12},
-                "text": [f"  {percent_interval(row.relative)}" if row in finite else "  nothing to compare"
-                         for row in shown],
-            }
-        )  # fmt: skip
-        layout[f"xaxis{axis}"] = axis_of(
-            range=[low - 0.05 * span, high + 0.5 * span], domain=domain(number, len(columns), 0.03), anchor="y",
-            side="top", title=f"change of {column.title} [%]", zeroline=True, zerolinecolor=INK, zerolinewidth=1.2,
-        )  # fmt: skip
-    layout["yaxis"] = axis_of(
-        range=[len(lines) - 0.4, -0.6], tickvals=list(range(len(lines))), ticktext=names, showgrid=False
+        for verdict, colour in VERDICTS.items():
+            own = [(place, row) for place, row in known if row.verdict == verdict]
+            data.append(_changes(own, colour, axis))
+        x = [digits(100.0 * row.relative.ends[1]) if row.relative.is_known else 0.0 for row in shown]
+        texts = [
+            f"  {percent_interval(row.relative) if row.relative.is_known else 'nothing to compare'}" for row in shown
+        ]
+        data.append(_texts(x, range(len(shown)), texts, axis))
+        layout[f"xaxis{axis}"] = base_axis(
+            f"change of {column.title} [%]",
+            range=[low - 0.05 * span, high + 0.5 * span],
+            domain=domain(number, len(columns), gap=0.03),
+            anchor="y",
+            side="top",
+            zeroline=True,
+            zerolinecolor=INK,
+            zerolinewidth=1.2,
+        )
+    names = [
+        f"<b>{chart_text(scope)}</b>" if line[0].is_group else chart_text(scope)
+        for scope, line in zip(scopes, lines, strict=True)
+    ]
+    layout["yaxis"] = base_axis(
+        range=[len(lines) - 0.4, -0.6],
+        tickvals=list(range(len(lines))),
+        ticktext=names,
+        showgrid=False,
     )
-    return Chart({"data": data, "layout": layout}, 80 + 27 * len(lines))
+    return PageChart({"data": data, "layout": layout}, 80 + 27 * len(lines))
 
 
-_VERDICT_WORDS = {
-    "lower": "lower", "higher": "higher", "none": "no difference shown", "unclear": "too few training seeds"
-}  # fmt: skip
-
-
-def _rungs(title: str, colour: str, symbol: str, places: Sequence[float], estimates: Sequence[Estimate], axis: str
-           ) -> Spec:  # fmt: skip
-    """Points of a policy with their intervals."""
-    kept = [(y, e) for y, e in zip(places, estimates, strict=True) if np.isfinite(e.value)]
+def _changes(own: Sequence[tuple[int, Change]], colour: str, axis: str) -> Spec:
+    """Changes of one verdict, with their intervals."""
+    relative = [row.relative.scaled(100.0) for _, row in own]
+    symbols = [_symbol(row) for _, row in own]
     return {
-        "type": "scatter", "mode": "markers", "name": chart_text(title), "xaxis": f"x{axis}",
-        "x": [digits(e.value) for _, e in kept], "y": [y for y, _ in kept],
-        "error_x": error_bars([e for _, e in kept], colour),
-        "marker": {"size": 10, "color": colour, "symbol": symbol},
-        "hoverinfo": "x+name",
-    }  # fmt: skip
-
-
-def _values(places: Sequence[float], estimates: Sequence[Estimate], cells: Sequence[list[Evaluation]], column: Column,
-            left: float, axis: str) -> Spec:  # fmt: skip
-    """Figures beside the points, with falls."""
-    x, text = [], []
-    for estimate, cell in zip(estimates, cells, strict=True):
-        failed, played = sum(e.num_failed for e in cell), sum(len(e.episodes) for e in cell)
-        what = cell[0].condition.environment.failure
-        crosses = f'  <b style="color:{VERDICTS["higher"]}">✕ {what} {failed}/{played}</b>' if failed else ""
-        known = np.isfinite(estimate.value)
-        end = estimate.value if estimate.high is None else estimate.high
-        x.append(digits(end) if known else 10 ** (left + 1e-3))
-        text.append(f"  {number_interval(estimate, column)}{crosses}" if known else crosses)
-    return {
-        "type": "scatter", "mode": "text", "x": x, "y": list(places), "text": text, "textposition": "middle right",
-        "textfont": {"size": 12, "color": INK}, "hoverinfo": "skip", "xaxis": f"x{axis}", "cliponaxis": False,
-    }  # fmt: skip
-
-
-def _scope_of(row: Change, with_reference: bool) -> str:
-    name = chart_text(f"{row.reference} · {row.scope}" if with_reference else row.scope)
-    return f"<b>{name}</b>" if row.is_group else name
+        "type": "scatter",
+        "mode": "markers",
+        "showlegend": False,
+        "xaxis": f"x{axis}",
+        "x": [digits(change.value) for change in relative],
+        "y": [place for place, _ in own],
+        "error_x": error_bars(relative, colour),
+        "marker": {
+            "size": 9,
+            "color": colour,
+            "symbol": symbols,
+            "line": {"width": 1.6, "color": colour},
+        },
+        "hoverinfo": "text",
+        "hovertext": [chart_text(f"{row.scope}: {row.sentence}") for _, row in own],
+    }
 
 
 def _symbol(row: Change) -> str:

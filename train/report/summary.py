@@ -1,4 +1,4 @@
-"""Tables of a comparison: one CSV of all episodes, a summary for the terminal, and the same, longer, as Markdown.
+"""The summary of a comparison: medians over the episodes of every cell, on the terminal and as Markdown.
 
 Scores of an episode that failed are never averaged in; failures are counted beside.
 """
@@ -8,85 +8,57 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column, Environment
-from train.evaluate.evaluate import Evaluation
-from train.report.fitting import print_fitting
-from train.runs.escaping import markdown_table, markdown_text, write_records
+from train.evaluate.episodes import Evaluation
+from train.report.render import Head, Row, Table, print_table, render
+from train.runs.escaping import markdown_text, write_records
 
 
 def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
     """Print the summary with as many columns as the terminal has room for; what policies are judged by stays."""
     known = evaluations[0].condition.environment
     columns = [column for column in known.columns if column.on_console]
-    judged = {column.metric for column in known.judged}
-    print_fitting(
-        console,
-        columns,
-        lambda shown: summary_table(evaluations, shown),
-        lambda column: column.title,
-        "summary.md",
-        stays=lambda column: column.metric in judged,
-    )
+    print_table(summary_table(evaluations, columns), console, "summary.md")
     for note in failure_notes(evaluations):
         console.print(note, markup=False)
 
 
-def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column] | None = None) -> Table:
+def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False) -> Table:
     """Median over the episodes of every cell that did not fail, failures beside them.
 
-    Args:
-        evaluations: The cells, of one environment.
-        columns: What to show; None for what the environment shows where there is little room.
+    Args: evaluations: The cells, of one environment. columns: Metrics to show. worst: Whether the
+        episode that is farthest from zero stands in brackets, where there are several.
     """
     known = evaluations[0].condition.environment
-    columns = [column for column in known.columns if column.on_console] if columns is None else columns
+    swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
+    judged = {column.metric for column in known.judged}
+    heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy")]
+    heads += [Head(name) for name in swept]
+    heads += [Head(c.title, c.unit, leaves=2 if c.metric in judged else 1) for c in columns]
+    heads += [Head(known.failure)]
+    rows = []
+    for e in evaluations:
+        condition = e.condition
+        names = [condition.reference_name, condition.scenario, condition.policy.title]
+        values = [f"{condition.swept[name]:g}" if name in condition.swept else "-" for name in swept]
+        figures = [_median(e, column, worst) for column in columns]
+        rows.append(Row((*names, *values, *figures, f"{e.num_failed}/{len(e.episodes)}")))
     title = f"{known.subject}, median over episodes"
-    table = Table(title=title, caption=escape(_legend(known, columns)), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    swept = _swept(evaluations)
-    for name in ("reference", "scenario", "policy"):
-        table.add_column(name, no_wrap=True, vertical="bottom")
-    for name in swept:
-        table.add_column(name.replace("_", "\n"), justify="right", no_wrap=True, vertical="bottom")
-    for column in columns:
-        lines = [*column.title.split(), column.unit]
-        table.add_column("\n".join(lines), justify="right", no_wrap=True, vertical="bottom")
-    table.add_column(known.failure, justify="right", no_wrap=True, vertical="bottom")
-    previous = None
-    for evaluation in evaluations:
-        cell = evaluation.condition.reference_name, evaluation.condition.scenario
-        if previous is not None and cell != previous:
-            table.add_section()
-        shown = ("", "") if cell == previous else cell
-        previous = cell
-        medians = [median(evaluation, column) for column in columns]
-        table.add_row(*map(escape, (*shown, evaluation.condition.policy.title)), *_swept_values(evaluation, swept),
-                      *medians, failures(evaluation))  # fmt: skip
-    return table
+    return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=_legend(known, columns))
 
 
-def median(evaluation: Evaluation, column: Column) -> str:
+def _median(evaluation: Evaluation, column: Column, worst: bool) -> str:
     """Median of a metric over the episodes that did not fail, - where there are none."""
     values = column.scale * evaluation.values(column.metric)
-    return _number(float(np.median(values)), column) if len(values) else "-"
-
-
-def median_and_worst(evaluation: Evaluation, column: Column) -> str:
-    """The median, and where there are several episodes the one farthest from zero in brackets."""
-    values = column.scale * evaluation.values(column.metric)
-    if len(values) < 2:
-        return median(evaluation, column)
-    return f"{median(evaluation, column)} ({_number(float(values[np.argmax(np.abs(values))]), column)})"
-
-
-def failures(evaluation: Evaluation) -> str:
-    """Episodes that failed, of all."""
-    return f"{evaluation.num_failed}/{len(evaluation.episodes)}"
+    if not len(values):
+        return "-"
+    found = f"{np.median(values):.{column.decimals}f}"
+    if not worst or len(values) < 2:
+        return found
+    return f"{found} ({values[np.argmax(np.abs(values))]:.{column.decimals}f})"
 
 
 def failure_notes(evaluations: Sequence[Evaluation]) -> list[str]:
@@ -113,54 +85,34 @@ def write_episodes(evaluations: Sequence[Evaluation], path: Path) -> Path:
 
 def write_summary(evaluations: Sequence[Evaluation], path: Path) -> Path:
     """The summary table and its splits as Markdown: medians, and the worst episode in brackets; by environment."""
-    groups = [list(group) for _, group in groupby(evaluations, key=lambda evaluation: evaluation.condition.env)]
-    write_whole(path, "\n\n".join(part for group in groups for part in _summarised(group)) + "\n")
+    groups = groupby(evaluations, key=lambda evaluation: evaluation.condition.env)
+    parts = [part for _, group in groups for part in _parts(list(group))]
+    write_whole(path, "\n\n".join(parts) + "\n")
     return path
 
 
-def _summarised(evaluations: Sequence[Evaluation]) -> list[str]:
+def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
     """The parts of a summary of one environment."""
     known = evaluations[0].condition.environment
     several = any(len(evaluation.episodes) > 1 for evaluation in evaluations)
     statistic = "Median over the episodes that did not fail" + (" (the worst of them in brackets)" if several else "")
-    head = f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; failures are counted beside."
-    parts = [head, _legend(known, known.columns), _markdown(evaluations, known.columns)]
+    parts = [
+        f"{known.subject[0].upper()}{known.subject[1:]}. {statistic}; failures are counted beside.",
+        _legend(known, known.columns),
+        render(summary_table(evaluations, known.columns, worst=True), "markdown"),
+    ]
     for title, columns in known.splits:
-        parts += [f"{title}:", _markdown(evaluations, columns)]
+        parts += [f"{title}:", render(summary_table(evaluations, columns, worst=True), "markdown")]
     notes = failure_notes(evaluations)
     if notes:
-        parts += ["Where all episodes failed:", "\n".join(f"* {markdown_text(note)}" for note in notes)]
-    return parts
-
-
-def _markdown(evaluations: Sequence[Evaluation], columns: Sequence[Column]) -> str:
-    swept, failure = _swept(evaluations), evaluations[0].condition.environment.failure
-    header = ["reference", "scenario", "policy", *swept, *(column.label for column in columns), failure]
-    rows = [
-        [
-            e.condition.reference_name, e.condition.scenario, e.condition.policy.title, *_swept_values(e, swept),
-            *(median_and_worst(e, column) for column in columns), failures(e),
+        parts += [
+            "Where all episodes failed:",
+            "\n".join(f"* {markdown_text(note)}" for note in notes),
         ]
-        for e in evaluations
-    ]  # fmt: skip
-    return markdown_table(header, ["---"] * len(header), rows)
+    return parts
 
 
 def _legend(known: Environment, columns: Sequence[Column]) -> str:
     """What the titles of the columns that are shown leave open."""
     notes = "; ".join(f"{column.title}: {column.note}" for column in columns if column.note)
     return " ".join(sentence for sentence in (notes and f"{notes}.", known.note) if sentence)
-
-
-def _swept(evaluations: Sequence[Evaluation]) -> list[str]:
-    """Names of what a sweep varies."""
-    return list(dict.fromkeys(name for evaluation in evaluations for name in evaluation.condition.swept))
-
-
-def _swept_values(evaluation: Evaluation, names: Sequence[str]) -> list[str]:
-    values = evaluation.condition.swept
-    return [f"{values[name]:g}" if name in values else "-" for name in names]
-
-
-def _number(value: float, column: Column) -> str:
-    return f"{value:.{column.decimals}f}"

@@ -5,20 +5,35 @@ from pathlib import Path
 
 from elastic_env.core.errors import missing_extra
 from elastic_env.core.files import write_whole
-from train.evaluate.changes import SIGNS_ARE, by_line
-from train.evaluate.evaluate import grouped
-from train.figures.figures import swept_scenarios
+from train.evaluate.changes import SIGNS_ARE
+from train.evaluate.environments import Column
+from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.statistics import Estimate
+from train.evaluate.table import EpisodeTable, score
+from train.figures.chart import Cells, learning_chart, sweep_chart, time_chart
+from train.figures.comparison_figures import (
+    by_option,
+    by_reference,
+    cells_together,
+    swept_scenarios,
+)
 from train.figures.map_plots import panels
+from train.report.change_tables import changes_table
 from train.report.charts import forest, ladder
-from train.report.curves import learning, over_time, sweep
-from train.report.leaderboard import PAIRED, board, legend, paired_rows, scenarios_board
+from train.report.leaderboard import PAIRED, board, claims_table, legend, scenarios_board
 from train.report.markdown import markdown
 from train.report.page import Page
-from train.report.robots_tables import ROBOTS, WORDS, robots_table
-from train.report.words import SCORES, Results, capital, in_short, notes, scores, summary, what
+from train.report.render import Table
+from train.report.report_text import Results, capital, facts, headline, in_short, notes
+from train.report.score_tables import ROBOTS, SCORES, robots_table, scores_table
+from train.report.specs import page_chart
 
 _LONG = 40
 """Rows from which on a table is folded away."""
+_POINTS = 600
+_LEAST_POINTS = 250
+_ALL_POINTS = 6000
+"""Points of a curve, at most and at least, and of all cells together, so that a large comparison stays small."""
 
 
 def require_plotly() -> str:
@@ -36,17 +51,21 @@ def require_plotly() -> str:
 
 def write_report(results: Results) -> list[Path]:
     """Write `report.html` and `report.md` beside the other files of a comparison."""
-    page, text = results.folder / "report.html", results.folder / "report.md"
+    page = results.folder / "report.html"
+    text = results.folder / "report.md"
     write_whole(page, _page(results).html(require_plotly()))
     write_whole(text, markdown(results))
     return [page, text]
 
 
 def _page(results: Results) -> Page:
-    known = results.lines.environment
-    page = Page(f"Comparison: {results.name}", f"{capital(known.subject)}; made {results.metadata['created'][:10]}")
-    page.section("What was compared", summary(results))
-    page.add("definitions", what(results))
+    known = results.environment
+    page = Page(
+        f"Comparison: {results.name}",
+        f"{capital(known.subject)}; made {results.metadata['created'][:10]}",
+    )
+    page.section("What was compared", headline(results))
+    page.add("definitions", facts(results))
     page.add("bullets", in_short(results))
     _add_leaderboard(page, results)
     _add_maps(page, results)
@@ -65,7 +84,8 @@ def _page(results: Results) -> Page:
             "Score over that of the base (dotted) on episodes that training never sees, mean over the trained "
             "scenarios: median over training seeds, band from the best to the worst.",
         )
-        page.add("chart", learning(results.learning, known.judged, results.lines.colour))
+        chart = learning_chart(results.learning, known.judged, results.colours)
+        page.add("chart", page_chart(chart))
     page.section("Notes")
     page.add("bullets", notes(results))
     return page
@@ -76,16 +96,16 @@ def _add_leaderboard(page: Page, results: Results) -> None:
     found = results.standings
     if not found:
         return
-    main, single = board(found), scenarios_board(found)
     page.section("Leaderboard", legend(found))
-    page.add("board", main)
-    table = paired_rows(found)
-    if table[1]:
+    page.add("table", board(found))
+    claims = claims_table(found)
+    if claims.rows:
         page.add("heading", "What learning adds")
         page.add("text", PAIRED)
-        _add_table(page, table, words=3)
+        _add_table(page, claims)
+    single = scenarios_board(found)
     if single is not None:
-        page.add("board", single, folded=f"Single scenarios, {main.columns[0][1]}")
+        page.add("table", single, folded=f"Single scenarios, {found[0].reference}")
 
 
 def _add_maps(page: Page, results: Results) -> None:
@@ -107,23 +127,28 @@ def _add_maps(page: Page, results: Results) -> None:
 def _add_ladder(page: Page, results: Results) -> None:
     seeds = (
         " Diamonds are residuals: interquartile mean over training seeds with its 95 % interval."
-        if results.families else ""
-    )  # fmt: skip
+        if results.table.members
+        else ""
+    )
     page.section(
         "Ladder of policies",
         f"Mean over the episodes that reached the end; lower is better, and the axis is logarithmic.{seeds}",
     )
-    references = results.lines.references
+    references = results.table.references
     for number, reference in enumerate(references):
-        chart = ladder(results.lines, reference)
-        title = results.lines.environment.title(reference)
-        page.add("chart", chart, folded=capital(title) if len(references) > 1 else None, is_open=number < 3)
+        chart = ladder(results.table, reference, results.colours)
+        title = results.environment.title(reference)
+        page.add(
+            "chart",
+            chart,
+            folded=capital(title) if len(references) > 1 else None,
+            is_open=number < 3,
+        )
 
 
 def _add_changes(page: Page, results: Results) -> None:
     """Forest charts and tables of residuals; baselines in a table of their own."""
     *of_residuals, (name_of_others, others) = results.grouped_changes.items()
-    more = {"colour": results.lines.colour, "swept": results.swept_options}
     for name, rows in of_residuals:
         if not rows:
             continue
@@ -138,13 +163,13 @@ def _add_changes(page: Page, results: Results) -> None:
             own = [row for row in rows if row.policy == title and row.is_judged]
             page.add("heading", f"{title} against {own[0].base}")
             page.add("chart", forest(own))
-        page.add("changes", {"lines": by_line(rows), **more}, _if_long("Table of changes", rows))
+        _add_table(page, changes_table(rows, results.colours), "Table of changes")
     if others:
         page.section(
             name_of_others,
             "Paired differences of means. Baselines are not trained: there are no training seeds to draw from.",
         )
-        page.add("changes", {"lines": by_line(others), **more}, _if_long("Table of differences", others))
+        _add_table(page, changes_table(others, results.colours), "Table of differences")
 
 
 def _add_robots(page: Page, results: Results) -> None:
@@ -152,68 +177,62 @@ def _add_robots(page: Page, results: Results) -> None:
     if not results.robots:
         return
     page.section("Drawn robots", ROBOTS)
-    _add_table(page, robots_table(results.robots), WORDS, "Table of drawn robots")
+    _add_table(page, robots_table(results.robots), "Table of drawn robots")
 
 
-def _add_table(page: Page, table: tuple[list[str], list[list[str]]], words: int, title: str = "Table") -> None:
-    """A table of a head and rows, whose first columns hold words; folded away under its title where it is long."""
-    head, rows = table
-    page.add("table", {"head": head, "rows": rows, "words": words}, _if_long(title, rows))
-
-
-def _if_long(title: str, rows: Sequence[object]) -> str | None:
-    """The title under which a table is folded away; None for a short one."""
-    return f"{title} ({len(rows)} rows)" if len(rows) > _LONG else None
+def _add_table(page: Page, table: Table, title: str = "Table") -> None:
+    """A table, folded away under its title where it is long."""
+    number = len(table.rows)
+    page.add("table", table, f"{title} ({number} rows)" if number > _LONG else None)
 
 
 def _add_phases(page: Page, results: Results) -> None:
-    for title, columns in results.lines.environment.splits:
+    for title, columns in results.environment.splits:
         page.section(title, SCORES)
-        _add_table(page, scores(results, columns), words=3 + len(results.swept_options))
+        _add_table(page, scores_table(results.table, columns))
 
 
 def _add_curves(page: Page, results: Results) -> None:
-    band = " Of residuals: median over training seeds, band from the least to the most." if results.families else ""
-    shade = " Single support is shaded." if results.lines.environment.splits else ""
+    """Signals of the first episodes over time, a chart for each motion and scenario."""
+    table = results.table
+    seeds = " Of residuals: median over training seeds, band from the least to the most."
+    band = seeds if table.members else ""
+    shade = " Single support is shaded." if table.environment.splits else ""
     text = f"The first episode of every cell; a line ends where the episode does.{band}{shade}"
     page.section("Curves over time", text)
-    first = True
-    for reference in results.lines.references:
-        for scenario in results.lines.scenarios:
-            chart = over_time(results.lines, reference, scenario)
-            if chart is not None:
-                title = f"{results.lines.environment.title(reference)}, {scenario}"
-                page.add("chart", chart, folded=capital(title), is_open=first)
-                first = False
+    most = min(_POINTS, max(_LEAST_POINTS, _ALL_POINTS // (len(table.references) * len(table.scenarios))))
+    traced = [e for e in results.evaluations if e.trace]
+    cells = group_by(traced, lambda e: (e.condition.reference_name, e.condition.scenario))
+    for number, ((reference, scenario), own) in enumerate(cells.items()):
+        policies = group_by(own, lambda e: e.condition.policy.title)
+        chart = time_chart(policies, table.environment.curves, results.colours, most)
+        title = f"{table.environment.title(reference)}, {scenario}"
+        page.add("chart", page_chart(chart), folded=capital(title), is_open=number == 0)
 
 
 def _add_sweeps(page: Page, results: Results) -> None:
     """Scores over the swept option, or over what the references differ in."""
-    lines = results.lines
-    charts = []
+    known = results.environment
+    charts: list[tuple[str, Cells, str]] = []
     if results.swept is not None:
-        for reference in lines.references:
-            for scenario in lines.scenarios:
-                cells = {t: lines.cell(t, reference_name=reference, scenario=scenario) for t in lines.titles}
-                points = {
-                    t: grouped(own, lambda e: next(iter(e.condition.swept.values()), None)) for t, own in cells.items()
-                }
-                charts.append((f"{lines.environment.title(reference)}, {scenario}", points, results.swept))
+        for own in cells_together(results.evaluations):
+            title = f"{known.title(own[0].condition.reference_name)}, {own[0].condition.scenario}"
+            charts.append((title, by_option(own), results.swept))
     else:
         for scenario in swept_scenarios(results.evaluations):
-            cells = {t: lines.cell(t, scenario=scenario) for t in lines.titles}
-            points = {
-                t: grouped((e for e in own if e.condition.number is not None), lambda e: e.condition.number)
-                for t, own in cells.items()
-            }
-            charts.append((f"scenario {scenario}", points, f"{lines.environment.quantity} [s]"))
+            own = [e for e in results.evaluations if e.condition.scenario == scenario]
+            charts.append((f"scenario {scenario}", by_reference(own), f"{known.quantity} [s]"))
     if not charts:
         return
     page.section(
         "Sweeps",
         "Means over the episodes that reached the end. A cross on top: all episodes of a policy failed there; an "
-        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.families else ""),
+        "open one: some did." + (" Bands are 95 % intervals over training seeds." if results.table.members else ""),
     )
-    for number, (title, points, label) in enumerate(charts):
-        chart = sweep(lines, {t: own for t, own in points.items() if own}, label)
-        page.add("chart", chart, folded=capital(title), is_open=number == 0)
+    for number, (title, cells, label) in enumerate(charts):
+        chart = sweep_chart(cells, known.judged, label, results.colours, _cell_score)
+        page.add("chart", page_chart(chart), folded=capital(title), is_open=number == 0)
+
+
+def _cell_score(cell: Sequence[Evaluation], column: Column) -> Estimate:
+    return score(EpisodeTable(cell).rows, column)

@@ -19,7 +19,7 @@ from baselines.residual.settings import ResidualSettings
 from elastic_env.core.signals import Array
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import blamed, make_policy, make_vector_env
+from train.evaluate.rollout import make_policy, make_vector_env, policy_errors
 
 PPO_DECISIONS = 512
 """Decisions that PPO collects before it learns from them."""
@@ -72,7 +72,7 @@ class VectorLoop(Contender):
         ctrl = self.env.unwrapped.simulation.ctrl
         self.controls = np.empty((steps, *ctrl.shape))
         begin = time.perf_counter()
-        with blamed(self._condition):
+        with policy_errors(self._condition):
             for step in range(steps):
                 self.step()
                 self.controls[step] = ctrl

@@ -17,7 +17,7 @@ from elastic_env.core.signals import Array
 from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, prefer_realtime
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
-from train.evaluate.evaluate import blamed, make_policy
+from train.evaluate.rollout import control_steps, make_policy, policy_errors
 from train.runs.folders import run_folder
 
 _PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
@@ -93,7 +93,7 @@ def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
         policy = make_policy(condition.policy, env)
         period_s = env.unwrapped.assumed_model.control_period_s  # type: ignore[attr-defined]
         cycles = max(round(config.seconds / period_s), 1)
-        with blamed(condition):
+        with policy_errors(condition):
             observations = _recorded(env, policy, cycles)
             is_real_time = prefer_realtime(Priority.LOOP)
             try:
@@ -107,14 +107,8 @@ def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
 
 def _recorded(env: Any, policy: Any, most: int) -> list[Any]:
     """Observations of an episode with the policy in its loop, at most so many."""
-    observation, _ = env.reset(seed=0)
-    found, state, start, is_over = [observation], None, np.array(True), False
-    while not is_over and len(found) < most:
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
-        observation, _, terminated, truncated, _ = env.step(action)
-        start, is_over = np.array(False), terminated or truncated
-        found.append(observation)
-    return found
+    steps = list(islice(control_steps(env, policy, seed=0), max(most - 1, 1)))
+    return [steps[0].seen, *(step.observation for step in steps)][:most]
 
 
 def _timed(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:

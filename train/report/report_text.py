@@ -1,4 +1,4 @@
-"""What a report says in words and tables, whatever it is written in: the results, what they are of, what to know."""
+"""The results of a comparison, and the sentences of a report, whatever it is written in."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from train.evaluate.changes import (
     BEST_ANALYTIC,
@@ -19,27 +20,19 @@ from train.evaluate.changes import (
     SAME_ROBOT,
     SIGNS_ARE,
     Change,
-    by_cell,
-    families,
-    level,
     percent,
     percent_interval,
 )
-from train.evaluate.environments import Column
-from train.evaluate.evaluate import Evaluation, grouped
+from train.evaluate.environments import Column, Environment
+from train.evaluate.episodes import Evaluation
 from train.evaluate.families import Origin
-from train.evaluate.leaderboard import Standing
-from train.evaluate.maps import HeatMap, best_of, failed_of
+from train.evaluate.maps import HeatMap, best_of
 from train.evaluate.progress import Curves, learning_curves
 from train.evaluate.robots import RobotScores
+from train.evaluate.standings import Standing
 from train.evaluate.statistics import Estimate
-from train.report.parts import Lines, number_interval
-
-SCORES = (
-    "Mean over the episodes that reached the end; of residuals the interquartile mean over training seeds, with its "
-    "95 % interval."
-)
-"""What the tables of scores hold."""
+from train.evaluate.table import EpisodeTable, failures, per_seed
+from train.figures.colours import policy_colours
 
 
 @dataclass(frozen=True)
@@ -67,20 +60,26 @@ class Results:
     robots: Sequence[RobotScores] = ()
 
     @cached_property
-    def families(self) -> dict[str, Origin]:
-        """Families of residuals and how they were trained."""
-        return families(self.evaluations)
+    def table(self) -> EpisodeTable:
+        """All episodes."""
+        return EpisodeTable(self.evaluations)
+
+    @property
+    def environment(self) -> Environment:
+        """The environment of all cells."""
+        return self.table.environment
 
     @cached_property
-    def lines(self) -> Lines:
-        """Policies with their colours."""
-        return Lines(self.evaluations)
+    def colours(self) -> dict[str, str]:
+        """Colours of the policies, the same in every chart."""
+        return policy_colours(self.table.policies)
 
     @cached_property
     def learning(self) -> dict[str, Curves]:
         """Learning curves of the families whose folders lie in a training run."""
-        columns = self.lines.environment.judged
-        found = {title: learning_curves(origin.folders, columns) for title, origin in self.families.items()}
+        columns = self.environment.judged
+        families = self.table.families.items()
+        found = {title: learning_curves(origin.folders, columns) for title, origin in families}
         return {title: curves for title, curves in found.items() if curves is not None}
 
     @cached_property
@@ -102,55 +101,49 @@ class Results:
         """Whether its cells are conditions of their own, and not points of a curve or a map."""
         return self.swept is None and not self.maps
 
-    @property
-    def swept_options(self) -> list[str]:
-        """Names of the options that a sweep varies."""
-        return list(dict.fromkeys(name for e in self.evaluations for name in e.condition.swept))
 
-
-def summary(results: Results) -> str:
+def headline(results: Results) -> str:
     """Three sentences: what was played and what failed, who is best, and what learning adds, or who comes last."""
-    played, lines = sum(len(e.episodes) for e in results.evaluations), results.lines
-    failed = sum(e.num_failed for e in results.evaluations)
+    table = results.table
+    failed, played = failures(table.rows)
     of_these = f"of which {failed} failed" if failed else "none of which failed"
     first = (
-        f"{_counted(len(lines.titles), 'policy', 'policies')} played {_counted(played, 'episode')} in "
-        f"{_counted(len(lines.scenarios), 'scenario')}, {of_these}."
+        f"{_counted(len(table.policies), 'policy', 'policies')} played {_counted(played, 'episode')} in "
+        f"{_counted(len(table.scenarios), 'scenario')}, {of_these}."
     )
-    best, worst = _ends(results)
+    best, worst = _best_and_worst(table)
     return " ".join([first, best, _learned(results) or worst])
 
 
-def _ends(results: Results) -> tuple[str, str]:
+def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
     """Sentences on the best and the worst policy by the first judged metric; one that fails less often is better."""
-    column = results.lines.environment.judged[0]
-    played = grouped(results.evaluations, lambda e: e.condition.policy.title)
-    scores = {title: (_mean_of_cells(own, column), failed_of(own)) for title, own in played.items()}
+    column = table.environment.judged[0]
+    scores = _scores(table.rows, column)
     best = best_of(scores)
     if best is None:
         return f"No policy has a {column.title}.", "No episode reached its end."
-    others = [title for title in scores if title != best and np.isfinite(scores[title][0].value)]
-    worst = max(others or [best], key=lambda title: (scores[title][1][0] / scores[title][1][1], scores[title][0].value))
+    others = [title for title in scores if title != best and scores[title][0].is_known]
+    worst = max(
+        others or [best],
+        key=lambda title: (scores[title][1][0] / scores[title][1][1], scores[title][0].value),
+    )
     shown = {t: f"{column.scale * scores[t][0].value:.{column.decimals}f} {column.unit}" for t in (best, worst)}
     found = f"The lowest {column.title} is that of {best}, a mean of {shown[best]}"
-    ahead = _cells_ahead(results.evaluations, best, column)
+    ahead = [best_of(_scores(rows, column)) == best for _, rows in table.rows.groupby("cell")]
     where = f"; it is ahead in {sum(ahead)} of {len(ahead)} cells" if len(ahead) > 1 and others else ""
-    return f"{found}{where}.", f"{worst} comes last, with {shown[worst]}." if others else "No other policy was played."
+    last = f"{worst} comes last, with {shown[worst]}." if others else "No other policy was played."
+    return f"{found}{where}.", last
 
 
-def _cells_ahead(evaluations: Sequence[Evaluation], policy: str, column: Column) -> list[bool]:
-    """Whether a policy is the best by a metric, for every cell of motion, scenario and swept value."""
-    ahead = []
-    for cell in grouped(evaluations, lambda e: e.condition.cell).values():
-        played = grouped(cell, lambda e: e.condition.policy.title)
-        ahead.append(best_of({t: (_mean_of_cells(own, column), failed_of(own)) for t, own in played.items()}) == policy)
-    return ahead
-
-
-def _mean_of_cells(evaluations: Sequence[Evaluation], column: Column) -> Estimate:
-    """Mean over the cells of a policy that have an episode which reached its end; nan where there is none [SI]."""
-    means = [float(values.mean()) for e in evaluations if len(values := e.values(column.metric))]
-    return Estimate(float(np.mean(means)) if means else float("nan"))
+def _scores(rows: pd.DataFrame, column: Column) -> dict[str, tuple[Estimate, tuple[int, int]]]:
+    """Mean of every policy over training seeds and cells with an episode that reached its end [SI], and failures."""
+    found = {}
+    for title, own in rows.groupby("policy", sort=False):
+        values = per_seed(own, column.metric)
+        known = values[np.isfinite(values)]
+        mean = float(known.mean()) if len(known) else float("nan")
+        found[str(title)] = Estimate(mean), failures(own)
+    return found
 
 
 def _learned(results: Results) -> str:
@@ -170,23 +163,27 @@ def _counted(number: int, one: str, several: str = "") -> str:
     return f"{number} {one if number == 1 else several or f'{one}s'}"
 
 
-def what(results: Results) -> list[tuple[str, str]]:
-    """What was compared, when and with what: terms and texts."""
-    lines, origin = results.lines, results.metadata
-    seeds = [episode["seed"] for e in results.evaluations for episode in e.episodes]
+def facts(results: Results) -> list[tuple[str, str]]:
+    """The subject of the comparison, its date and versions: terms and texts."""
+    table = results.table
+    origin = results.metadata
+    seeds = table.rows["seed"].tolist()
     per_cell = sorted({len(e.episodes) for e in results.evaluations})
     versions = ", ".join(f"{name} {version}" for name, version in origin["versions"].items() if version)
-    quantity = lines.environment.quantity or "reference"
-    each = " and training seed" if results.families else ""
+    quantity = table.environment.quantity or "reference"
+    each = " and training seed" if table.members else ""
     found = [
-        ("policies", ", ".join(lines.titles)),
-        (f"{quantity}s", ", ".join(lines.references)),
-        ("scenarios", ", ".join(lines.scenarios)),
-        ("episodes", f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}"),
+        ("policies", ", ".join(table.policies)),
+        (f"{quantity}s", ", ".join(table.references)),
+        ("scenarios", ", ".join(table.scenarios)),
+        (
+            "episodes",
+            f"{_span(per_cell)} per cell{each}, seeds {_span(sorted({min(seeds), max(seeds)}))}",
+        ),
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]
-    return found + [(title, _trained(origin)) for title, origin in results.families.items()]
+    return found + [(title, _trained(origin)) for title, origin in table.families.items()]
 
 
 def _trained(origin: Origin) -> str:
@@ -201,7 +198,7 @@ def _trained(origin: Origin) -> str:
 def in_short(results: Results) -> list[str]:
     """What learning adds in a sentence each; then per residual and metric in how many cells it is better, or worse."""
     found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)] + claims(results)
-    for title in results.families:
+    for title in results.table.members:
         for is_rival in (False, True):
             rows = [r for r in results.changes if r.policy == title and r.is_judged and r.is_rival == is_rival]
             for column in dict.fromkeys(row.column for row in rows):
@@ -215,7 +212,8 @@ def in_short(results: Results) -> list[str]:
 
 def of_a_map(heat_map: HeatMap) -> list[str]:
     """Who is best in how many cells of a map, and where learning is ahead of the best policy without it."""
-    where, cells = f"{heat_map.column.title}, {heat_map.title}", heat_map.flat
+    where = f"{heat_map.column.title}, {heat_map.title}"
+    cells = heat_map.flat
     wins = {title: sum(cell.best == title for cell in cells) for title in heat_map.policies}
     ranking = sorted((title for title in wins if wins[title]), key=lambda title: -wins[title])
     found = [
@@ -256,11 +254,19 @@ def claims(results: Results) -> list[str]:
     found = []
     for rival in pooled or (rivals if few else []):
         base = next(
-            row for row in judged
+            row
+            for row in judged
             if not row.is_rival
             and (row.policy, row.reference, row.scope, row.is_group, row.swept, row.column)
-            == (rival.policy, rival.reference, rival.scope, rival.is_group, rival.swept, rival.column)
-        )  # fmt: skip
+            == (
+                rival.policy,
+                rival.reference,
+                rival.scope,
+                rival.is_group,
+                rival.swept,
+                rival.column,
+            )
+        )
         where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
         found.append(
             f"{rival.policy}, {rival.column.title}, {where}{marked(rival)}: {_compared(base)} than {base.base}, its "
@@ -311,7 +317,7 @@ def _tally(cells: Sequence[Change]) -> str:
 
 
 def _at(results: Results, row: Change) -> str:
-    several = len(results.lines.references) > 1
+    several = len(results.table.references) > 1
     swept = [f"{name}={value:g}" for name, value in row.swept.items()]
     return "".join(f", {part}" for part in [*([row.reference] if several else []), *swept])
 
@@ -323,13 +329,13 @@ def marked(row: Change) -> str:
 
 def notes(results: Results) -> list[str]:
     """What a reader needs to know, and only what concerns this comparison."""
-    failure = results.lines.environment.failures
+    failure = results.environment.failures
     notes = [
         "A change is the mean of a policy over the episodes, over the mean of its base over the same episodes, minus "
         "one. An episode in which either did not reach the end is left out of both and counted under "
         f"{failure}. Below zero is better.",
     ]
-    if results.families:
+    if results.table.members:
         notes.append(
             "Figures of residuals are interquartile means over training seeds with 95 % percentile bootstrap "
             "intervals over training seeds (never over the episodes of one); where a table shows base → policy, plain "
@@ -368,7 +374,7 @@ def notes(results: Results) -> list[str]:
             f"Marked {SAME_ROBOT!r}: training and evaluation have the same robot and motion there, and differ by "
             "sensor noise alone. It says that the residual has learned this robot, not that it fits others."
         )
-    for title, origin in results.families.items():
+    for title, origin in results.table.families.items():
         if len(origin.folders) == 1:
             notes.append(f"{title} is a single training seed: another one may come out differently.")
         elif len(origin.folders) < FEWEST_SEEDS:
@@ -391,23 +397,3 @@ def _span(numbers: Sequence[int]) -> str:
 def capital(text: str) -> str:
     """With a capital at the beginning."""
     return text[:1].upper() + text[1:]
-
-
-def scores(results: Results, columns: Sequence[Column]) -> tuple[list[str], list[list[str]]]:
-    """Head and rows of a table of scores."""
-    swept, lines = results.swept_options, results.lines
-    head = ["reference", "scenario", "policy", *swept, *(column.label for column in columns)]
-    rows = []
-    for reference in lines.references:
-        for scenario in lines.scenarios:
-            for title in lines.titles:
-                found = by_cell(lines.cell(title, reference_name=reference, scenario=scenario))
-                for cell in found.values():
-                    values = cell[0].condition.swept
-                    rows.append(
-                        [
-                            reference, scenario, title, *(f"{values[n]:g}" if n in values else "-" for n in swept),
-                            *(number_interval(level(cell, c).scaled(c.scale), c) for c in columns),
-                        ]
-                    )  # fmt: skip
-    return head, rows

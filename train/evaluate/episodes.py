@@ -1,0 +1,293 @@
+"""Episodes of a policy under a condition: metrics of each, one time series, and the static points."""
+
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+
+from baselines.identification.static_points import HoldRecorder, StaticPoints
+from elastic_env.core.signals import Array, BoolArray
+from elastic_env.runtime.robot_model import WalkerModel
+from train.evaluate.conditions import Condition
+from train.evaluate.rollout import control_steps, make_policy, make_shared_env, policy_errors
+from train.evaluate.support_changes import SupportChanges
+
+MOST_WORLDS = 64
+"""Worlds that are played at once."""
+_BEFORE_FALL_S = 0.6
+"""What happens in this time before a fall does not set the scale of a figure [s]."""
+
+_REPORTED = 250
+"""Control steps after which progress is reported."""
+
+Progress = Callable[[int], None]
+ItemT = TypeVar("ItemT")
+KeyT = TypeVar("KeyT", bound=Hashable)
+
+
+@dataclass
+class Evaluation:
+    """What came out of a condition.
+
+    Attributes: condition: The condition. episodes: Flat records, one per episode: seed, metrics,
+        termination. trace: Signals of the first episode over time, those that the environment's
+        description names. points: Static points of the first episode, with reference "hold".
+        rest_references: References of the static points, (visits,) [rad].
+    """
+
+    condition: Condition
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    trace: dict[str, Array] = field(default_factory=dict)
+    points: StaticPoints | None = None
+    rest_references: Array = field(default_factory=lambda: np.zeros(0))
+
+    def values(self, metric: str, failed: bool = False) -> Array:
+        """A metric over the episodes that did not fail, or over those that did, (n,); empty where none has it."""
+        found = [episode.get(metric) for episode in self.episodes if bool(episode["termination"]) == failed]
+        return np.array([value for value in found if value is not None], dtype=np.float64)
+
+    @property
+    def num_failed(self) -> int:
+        """Episodes that ended in a failure, such as a fall."""
+        return sum(1 for episode in self.episodes if episode["termination"])
+
+    @property
+    def first_failed(self) -> bool:
+        """Whether the episode of the trace is one of them."""
+        return bool(self.episodes and self.episodes[0]["termination"])
+
+    @property
+    def is_steady(self) -> BoolArray:
+        """Samples of the trace that a figure's range goes by: all but those shortly before a fall."""
+        time_s = self.trace["time_s"]
+        return time_s <= max(time_s[-1] - (_BEFORE_FALL_S if self.first_failed else 0.0), 0.0)
+
+
+def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT, list[ItemT]]:
+    """Items such as evaluations by what they have in common, in the order in which it first occurs."""
+    groups: dict[KeyT, list[ItemT]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
+def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
+    """Play all episodes of a condition. Episode i has seed + i, whatever the number of worlds and threads.
+
+    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it
+    may play episodes of the robots that it is scored on, under other noise, see
+    `baselines.adaptation.iterative`.
+
+    Args: condition: What to play. progress: Called with the number of control steps done since the
+        last call, of all episodes together. num_threads: Threads of the physics, 0 for all cores.
+    """
+    return evaluate_together([condition], progress, num_threads)[0]
+
+
+def evaluate_together(
+    conditions: Sequence[Condition], progress: Progress | None = None, num_threads: int = 0
+) -> list[Evaluation]:
+    """Play conditions of one policy side by side, which costs less; their results are those of `evaluate`.
+
+    Args: conditions: What to play: one, or several with the same `shared_settings` that can share
+        worlds. progress: See `evaluate`. num_threads: See `evaluate`.
+    """
+    results = [Evaluation(condition) for condition in conditions]
+    episodes = [(result, number) for result in results for number in range(result.condition.episodes)]
+    at_once = 1 if conditions[0].environment.is_real else MOST_WORLDS
+    for first in range(0, len(episodes), at_once):
+        batch = episodes[first : first + at_once]
+        with closing(make_shared_env([result.condition for result, _ in batch], num_threads)) as env:
+            _play(env, batch, progress or (lambda _: None))
+    return results
+
+
+def _play(env: Any, episodes: Sequence[tuple[Evaluation, int]], progress: Progress) -> None:
+    """Episodes of conditions, by their numbers, a world each; in every world the first episode counts."""
+    condition = episodes[0][0].condition
+    seeds = [result.condition.seed + number for result, number in episodes]
+    policy = make_policy(condition.policy, env, condition.policy_options)
+    if hasattr(policy, "rehearse"):
+        with policy_errors(condition, 0):
+            policy.rehearse(env, seeds[0])
+    observers = _Observers(env, policy, episodes)
+    records: dict[int, dict[str, Any]] = {}
+    reported = 0
+    for step in control_steps(env, policy, seeds, condition, observers.watch):
+        for world in np.flatnonzero(step.is_over).tolist():
+            if world not in records:
+                result, number = episodes[world]
+                metrics = {name: values[world].item() for name, values in step.info["episode_metrics"].items()}
+                records[world] = {
+                    **episode_labels(result.condition, number),
+                    "termination": str(step.info["termination"][world]),
+                    **metrics,
+                    **observers.metrics(world),
+                }
+                observers.end(world, step.observation, step.info)
+        if len(records) == len(episodes):
+            break
+        if (step.number + 1) % _REPORTED == 0:
+            reported += _REPORTED
+            progress(len(episodes) * _REPORTED)
+    progress(len(episodes) * (env.unwrapped.task.num_steps - reported))
+    for world, (result, _) in enumerate(episodes):
+        result.episodes.append(records[world])
+        observers.keep_trace(world, result)
+
+
+def episode_labels(condition: Condition, episode: int) -> dict[str, Any]:
+    """The part of a record that is known before the episode: cell, training seed, and seed of the episode."""
+    member = condition.member
+    seed = None if member is None else member.training_seed
+    return {
+        "policy": condition.policy.title,
+        "training_seed": "" if seed is None else seed,
+        "base": "" if member is None else member.base,
+        "scenario": condition.scenario,
+        "reference": condition.reference_name,
+        **condition.environment.abscissa(condition.reference),
+        **condition.swept,
+        "seed": condition.seed + episode,
+    }
+
+
+class _Observers:
+    """Figures that no environment keeps: of the IMU, of a policy's estimate, and the trace of first episodes."""
+
+    def __init__(self, env: Any, policy: Any, episodes: Sequence[tuple[Evaluation, int]]) -> None:
+        task = env.unwrapped.task
+        environment = episodes[0][0].condition.environment
+        has_estimate = hasattr(policy, "link_estimate") and not environment.is_real
+        walks = isinstance(task.assumed_model, WalkerModel)
+        self._env = env
+        self._policy = policy
+        self._task = task
+        self._estimates = _Estimates(task, len(episodes)) if has_estimate else None
+        self._imu = _ImuError(task, len(episodes)) if walks else None
+        self._traces = {
+            world: _Trace(task, environment.traced, world) for world, (_, number) in enumerate(episodes) if number == 0
+        }
+        self._ended = set[int]()
+
+    def watch(self, step: int, observation: Array, info: dict[str, Any], memory: Any) -> None:
+        """See a control step between the command and its effect."""
+        for world, trace in self._traces.items():
+            if world not in self._ended:
+                trace.take(observation, info)
+        if self._imu is not None:
+            self._imu.take(observation, info)
+        if self._estimates is not None:
+            estimate = self._policy.link_estimate(observation, memory)
+            self._estimates.take(step, estimate, observation, self._env.unwrapped.truth())
+
+    def metrics(self, world: int) -> dict[str, float]:
+        """Figures of a world over its episode so far."""
+        found: dict[str, float] = {}
+        for observer in (self._estimates, self._imu):
+            found |= {} if observer is None else observer.metrics(world)
+        if hasattr(self._task, "robot_record"):  # of the robots that a walker draws from ranges
+            found |= self._task.robot_record(world)
+        return found
+
+    def end(self, world: int, observation: Array, info: dict[str, Any]) -> None:
+        """Take the last sample of a world."""
+        self._ended.add(world)
+        if world in self._traces:
+            self._traces[world].take(observation, info)
+
+    def keep_trace(self, world: int, result: Evaluation) -> None:
+        """Put the trace of a first episode into its evaluation."""
+        if world in self._traces:
+            trace = self._traces[world]
+            result.trace = trace.signals()
+            result.points = trace.points()
+            result.rest_references = trace.references
+
+
+class _Rms:
+    """RMS over the scored steps of every world."""
+
+    def __init__(self, task: Any, worlds: int) -> None:
+        self._task = task
+        self._sum = np.zeros(worlds)
+        self._count = np.zeros(worlds)
+
+    def take(self, squared: Array) -> None:
+        scored = self._task.masks(self._task.sample())["scored"]
+        self._sum += np.where(scored, squared, 0.0)
+        self._count += scored
+
+    def of(self, world: int) -> float:
+        count = self._count[world]
+        return float(np.sqrt(self._sum[world] / count)) if count else float("nan")
+
+
+class _ImuError:
+    """Roll and pitch by a walker's IMU, as old as they are shown, against the truth."""
+
+    def __init__(self, task: Any, worlds: int) -> None:
+        self._rms = _Rms(task, worlds)
+        self._attitude = task.observation_table.group("imu_attitude")
+
+    def take(self, observation: Array, info: dict[str, Any]) -> None:
+        error = observation[:, self._attitude] - np.stack([info["pelvis_roll"], info["pelvis_pitch"]], axis=1)
+        self._rms.take(np.square(error).sum(axis=1))
+
+    def metrics(self, world: int) -> dict[str, float]:
+        """RMS of the angle by which the shown vertical is off."""
+        return {"imu_error_rms_rad": self._rms.of(world)}
+
+
+class _Estimates:
+    """A policy's estimate of the link angles against the truth, and on a walker what it makes of the local frame."""
+
+    def __init__(self, task: Any, worlds: int) -> None:
+        self._rms = _Rms(task, worlds)
+        self._changes = SupportChanges(task.assumed_model) if isinstance(task.assumed_model, WalkerModel) else None
+
+    def take(self, step: int, estimate: Array, observation: Array, truth: Any) -> None:
+        self._rms.take(np.square(estimate - truth.q).mean(axis=1))
+        if self._changes is not None:
+            self._changes.take(step, estimate, observation, truth)
+
+    def metrics(self, world: int) -> dict[str, float]:
+        """RMS over the scored steps, and the figures of the support changes."""
+        changes = self._changes.metrics(world) if self._changes is not None else {}
+        return {"link_estimate_error_rms_rad": self._rms.of(world), **changes}
+
+
+class _Trace:
+    """Time series and static points of the first episode of a condition, that of a world."""
+
+    def __init__(self, task: Any, traced: tuple[str, ...], world: int) -> None:
+        self._traced = traced
+        self._world = world
+        self._encoder = task.observation_table.group("encoder_angle")
+        self.references = np.zeros(0)
+        self._recorder: HoldRecorder | None = None
+        visits = getattr(getattr(task.config, "reference", None), "visits", None)
+        if visits is not None and "link_angle_imu" in traced:  # static points need the IMU of the only link
+            self.references, directions = visits
+            self._recorder = HoldRecorder(directions)
+        self._rows: list[tuple[float, ...]] = []
+
+    def take(self, observation: Array, info: dict[str, Any]) -> None:
+        """Take a sample."""
+        own = slice(self._world, self._world + 1)
+        self._rows.append(tuple(float(info[name][self._world]) for name in self._traced))
+        if self._recorder is not None:
+            encoder = observation[own, self._encoder][:, 0]
+            self._recorder.take(encoder, info["link_angle_imu"][own], int(info["rest"][self._world]))
+
+    def signals(self) -> dict[str, Array]:
+        """Time series by name."""
+        return dict(zip(self._traced, np.array(self._rows).T, strict=True))
+
+    def points(self) -> StaticPoints | None:
+        """Static points; None where the motion did not visit all of them."""
+        if self._recorder is None or not self._recorder.is_complete:
+            return None
+        return self._recorder.points()[0]

@@ -1,0 +1,249 @@
+"""The rollout of a policy: how its environment and the policy are made, and one generator of control steps."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+import baselines
+import elastic_env  # noqa: F401  registers the environments
+from baselines.catalogue import Track
+from baselines.policies import is_saved, track
+from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
+from elastic_env.core.signals import BoolArray
+from elastic_env.runtime.scenario import make_scenario
+from train.evaluate.conditions import Condition, PolicySpec
+from train.runs.failures import is_full
+from train.runs.user_code import named_object
+
+Watch = Callable[[int, Any, Any, Any], None]
+"""Sees number, observation, info and memory of a control step, before the world moves."""
+
+
+class PolicyFailedError(ElasticError):
+    """A policy raised, or commanded what no action can be."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControlStep:
+    """One control step of a rollout.
+
+    Attributes: number: From 0 on. seen: Observation that the policy acted on. action: Its command.
+        observation: Observation after the step. info: Info after the step. terminated: Worlds that
+        failed in this step, (num_worlds,); of a scalar environment one truth value. truncated:
+        Worlds that reached their end.
+    """
+
+    number: int
+    seen: Any
+    action: Any
+    observation: Any
+    info: Any
+    terminated: Any
+    truncated: Any
+
+    @property
+    def is_over(self) -> BoolArray:
+        """Worlds whose episode ended in this step."""
+        return np.asarray(self.terminated) | np.asarray(self.truncated)
+
+
+def control_steps(
+    env: Any,
+    policy: Any,
+    seed: Any,
+    condition: Condition | None = None,
+    watch: Watch | None = None,
+) -> Iterator[ControlStep]:
+    """Play a policy from a reset on, one control step at a time, in one world or in many.
+
+    A scalar environment stops at the end of its episode. The worlds of a vector environment go on,
+    each with the next episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads
+    the steps stops when there are enough.
+
+    Args:
+        env: The environment.
+        policy: Anything with `predict`.
+        seed: Of the reset; of a vector environment one for each world, or one for all.
+        condition: What is played, for the errors of the policy; None to let them pass.
+        watch: Called between the command and the step.
+
+    Raises:
+        PolicyFailedError: The policy of the condition failed.
+    """
+    is_vector = hasattr(env, "num_envs")
+    mode = env.metadata.get("autoreset_mode") if is_vector else None
+    observation, info = env.reset(seed=seed)
+    memory: Any = None
+    begins = np.ones(env.num_envs if is_vector else (), dtype=np.bool_)
+    was_over = np.zeros_like(begins)
+    for number in count():
+        with nullcontext() if condition is None else policy_errors(condition, number):
+            action, memory = policy.predict(observation, state=memory, episode_start=begins, deterministic=True)
+            if watch is not None:
+                watch(number, observation, info, memory)
+            after, _, terminated, truncated, info = env.step(action)
+        step = ControlStep(number, observation, action, after, info, terminated, truncated)
+        yield step
+        observation = after
+        is_over = step.is_over
+        if not is_vector and is_over:
+            return
+        if mode is AutoresetMode.DISABLED and is_over.any():
+            observation, _ = env.reset(options={"reset_mask": is_over})
+        # by itself a world begins anew in the step after its end
+        begins = was_over if mode is AutoresetMode.NEXT_STEP else is_over
+        was_over = is_over
+
+
+@contextmanager
+def policy_errors(condition: Condition, step: int | None = None) -> Iterator[None]:
+    """Say of what a policy does within whose it is, and where.
+
+    Args:
+        condition: What is played.
+        step: Control step; None where nobody counts.
+
+    Raises:
+        PolicyFailedError: It raises, ends the program, or its action is none.
+    """
+    try:
+        yield
+    except (SystemFailedError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:
+        if is_full(error):
+            raise
+        kind = "" if isinstance(error, ElasticError) else f"{type(error).__name__}: "
+        when = "" if step is None else f", at control step {step}"
+        raise PolicyFailedError(
+            f"the policy {condition.policy.title!r} failed in scenario {condition.scenario!r}, "
+            f"{condition.reference_name}{when}: {kind}{error}"
+        ) from error
+
+
+def make_policy(spec: PolicySpec, env: Any, options: dict[str, Any] | None = None) -> Any:
+    """The policy of a specification for an environment.
+
+    Args:
+        spec: The specification.
+        env: The environment.
+        options: Options instead of its own.
+
+    Raises:
+        ConfigurationError: The name is neither a baseline nor an importable function.
+    """
+    options = spec.options if options is None else options
+    if ":" not in spec.name or is_saved(spec.name):
+        return baselines.make(spec.name, env, **options)
+    try:
+        function = named_object(spec.name)
+    except ConfigurationError as error:
+        raise _not_a_policy(spec, str(error)) from error
+    attribute = spec.name.rpartition(":")[2]
+    if not callable(function):
+        raise _not_a_policy(spec, f"{attribute} is no function but of type {type(function).__name__}")
+    try:
+        return function(env, **options)
+    except ElasticError:
+        raise
+    except Exception as error:
+        problem = f"{attribute}(env, ...) raised {type(error).__name__}: {error}"
+        raise _not_a_policy(spec, problem) from error
+
+
+def _not_a_policy(spec: PolicySpec, problem: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"policy {spec.name!r}: {problem}; give a baseline ({', '.join(baselines.policy_names())}) or "
+        '"FILE.py:function" or "module:function", a function that takes the environment and returns an object with '
+        "predict()"
+    )
+
+
+def make_vector_env(
+    condition: Condition,
+    num_envs: int,
+    num_threads: int = 0,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+) -> Any:
+    """The vector environment of a condition.
+
+    Raises:
+        ConfigurationError: Unknown environment, scenario, reference or argument.
+    """
+    return gymnasium.make_vec(
+        condition.environment.id,
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        num_threads=num_threads,
+        autoreset_mode=autoreset_mode,
+        **condition.arguments,
+    )
+
+
+def make_shared_env(
+    conditions: Sequence[Condition],
+    num_threads: int = 0,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+) -> Any:
+    """A vector environment with a world of each condition, whose scenarios may differ, see `shared_settings`.
+
+    Raises:
+        ConfigurationError: Unknown environment, scenario, reference or argument.
+    """
+    first = conditions[0]
+    scenarios = [condition.scenario_played for condition in conditions]
+    if all(scenario == scenarios[0] for scenario in scenarios):
+        return make_vector_env(first, len(conditions), num_threads, autoreset_mode)
+    return gymnasium.make_vec(
+        first.environment.id,
+        num_envs=len(conditions),
+        vectorization_mode="vector_entry_point",
+        num_threads=num_threads,
+        autoreset_mode=autoreset_mode,
+        **{**first.arguments, "scenario": scenarios},
+    )
+
+
+def shared_settings(condition: Condition) -> str:
+    """What conditions must have in common for a vector environment in common.
+
+    That is everything but the scenario of a walker, of which a policy knows the friction and the
+    rate of the IMU.
+    """
+    scenario = make_scenario(condition.scenario_played)
+    walks = condition.environment.walks
+    known = (scenario.friction_scale, scenario.pelvis_imu.rate_hz) if walks else scenario
+    return repr((condition.env, {**condition.arguments, "scenario": known}))
+
+
+def can_share_worlds(condition: Condition) -> bool:
+    """Whether its policy does the same beside worlds of other scenarios.
+
+    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are
+    of one.
+    """
+    name = condition.policy.name
+    if ":" in name and not is_saved(name):
+        return False
+    return track(name, condition.environment.walks) not in (Track.TRUTH, Track.WALKS)
+
+
+def single_world_envs(conditions: Iterable[Condition]) -> Iterator[tuple[Condition, Any]]:
+    """Conditions, each with an environment of one world, which those that differ by their policy share."""
+    made: dict[str, Any] = {}
+    for condition in conditions:
+        key = repr((condition.env, condition.arguments))
+        if key not in made:
+            made[key] = make_vector_env(condition, 1)
+        yield condition, made[key]
+
+
+def num_steps(conditions: Iterable[Condition]) -> list[int]:
+    """Control steps that all episodes of each condition take together, for progress bars."""
+    return [condition.episodes * env.unwrapped.task.num_steps for condition, env in single_world_envs(conditions)]

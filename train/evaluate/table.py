@@ -1,0 +1,151 @@
+"""The table of all episodes of a comparison, a row each: every statistic groups its rows."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from elastic_env.core.signals import Array
+from train.evaluate.conditions import Condition, Member
+from train.evaluate.environments import Column
+from train.evaluate.episodes import Evaluation
+from train.evaluate.families import Origin, origin
+from train.evaluate.statistics import Estimate, over_seeds
+
+
+class EpisodeTable:
+    """All episodes of a comparison.
+
+    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have
+    numbers.
+
+    Args:
+        evaluations: All cells, one per training seed.
+
+    Attributes: rows: A row per episode, with `policy`, `member` (folder of a training seed; empty
+        of a policy
+            that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the
+            metrics [SI], nan where the episode failed.
+        cells: Number of every cell, by `Condition.cell`.
+        conditions: The first condition of every policy and cell.
+        members: Training seeds of every residual, by title and folder.
+    """
+
+    def __init__(self, evaluations: Sequence[Evaluation]) -> None:
+        self.evaluations = list(evaluations)
+        self.environment = evaluations[0].condition.environment
+        self.cells: dict[tuple[object, ...], int] = {}
+        self.conditions: dict[tuple[str, int], Condition] = {}
+        self.members: dict[str, dict[str, Member]] = {}
+        records = []
+        for e in evaluations:
+            condition = e.condition
+            title = condition.policy.title
+            member = condition.member
+            cell = self.cells.setdefault(condition.cell, len(self.cells))
+            self.conditions.setdefault((title, cell), condition)
+            if member is not None:
+                self.members.setdefault(title, {})[member.folder] = member
+            labels = {
+                "policy": title,
+                "member": "" if member is None else member.folder,
+                "reference": condition.reference_name,
+                "scenario": condition.scenario,
+                "cell": cell,
+            }
+            records += [{**episode, **labels, "failed": bool(episode["termination"])} for episode in e.episodes]
+        self.rows = pd.DataFrame(records)
+        for metric in self._metrics:
+            values = pd.to_numeric(self.rows[metric]) if metric in self.rows else np.nan
+            self.rows[metric] = pd.Series(values, self.rows.index, np.float64).where(~self.rows["failed"])
+
+    @property
+    def _metrics(self) -> set[str]:
+        known = self.environment
+        columns = [*known.columns, *known.judged, *known.also]
+        columns += [column for _, split in known.splits for column in split]
+        return {column.metric for column in columns}
+
+    @cached_property
+    def policies(self) -> list[str]:
+        """Titles of the policies."""
+        return list(dict.fromkeys(title for title, _ in self.conditions))
+
+    @cached_property
+    def references(self) -> list[str]:
+        """Labels of the motions."""
+        return list(dict.fromkeys(c.reference_name for c in self.conditions.values()))
+
+    @cached_property
+    def scenarios(self) -> list[str]:
+        """Names of the scenarios."""
+        return list(dict.fromkeys(c.scenario for c in self.conditions.values()))
+
+    @cached_property
+    def swept(self) -> list[str]:
+        """Names of what a sweep or a map varies."""
+        return list(dict.fromkeys(name for c in self.conditions.values() for name in c.swept))
+
+    @cached_property
+    def families(self) -> dict[str, Origin]:
+        """Residuals by title, with how they were trained."""
+        return {title: origin(list(members.values())) for title, members in self.members.items()}
+
+    def condition(self, policy: str) -> Condition:
+        """The first condition of a policy."""
+        return next(c for (title, _), c in self.conditions.items() if title == policy)
+
+    def cells_of(self, policy: str, reference: str | None = None, scenario: str | None = None) -> list[int]:
+        """Numbers of the cells that a policy plays, with a motion and in a scenario where these are given."""
+        return [
+            cell
+            for (title, cell), c in self.conditions.items()
+            if title == policy and reference in (None, c.reference_name) and scenario in (None, c.scenario)
+        ]
+
+    def of(self, policy: str, *cells: int) -> pd.DataFrame:
+        """Rows of a policy in some cells."""
+        return pd.concat([self._parts[policy, cell] for cell in cells])
+
+    @cached_property
+    def _parts(self) -> dict[tuple[str, int], pd.DataFrame]:
+        parts: Any = self.rows.groupby(["policy", "cell"])
+        return dict(iter(parts))
+
+
+def means(values: pd.Series) -> float:
+    """Mean of the episodes that have a figure; nan where none has one."""
+    known = values.dropna().to_numpy()
+    return float(known.mean()) if len(known) else float("nan")
+
+
+def per_seed(rows: pd.DataFrame, metric: str, statistic: Callable[[pd.Series], float] = means) -> Array:
+    """A statistic of a metric for each training seed and cell, (seeds, cells), in the order of the rows."""
+    parts: Any = rows.groupby(["member", "cell"])[metric]
+    found = {key: statistic(own) for key, own in parts}
+    members = rows["member"].unique()
+    cells = rows["cell"].unique()
+    return np.array([[found.get((member, cell), np.nan) for cell in cells] for member in members])
+
+
+def score(rows: pd.DataFrame, column: Column, statistic: Callable[[pd.Series], float] = means) -> Estimate:
+    """Mean over cells of a metric of one policy [SI]; of several training seeds the interquartile mean.
+
+    Args:
+        rows: Rows of one policy in one or several cells.
+        column: The metric.
+        statistic: Over the episodes of a cell; the mean, over those that did not fail.
+    """
+    return estimate(rows, per_seed(rows, column.metric, statistic).mean(axis=-1))
+
+
+def estimate(rows: pd.DataFrame, values: Array) -> Estimate:
+    """An estimate from one value per training seed; of a policy that was not trained it is the value."""
+    return over_seeds(values) if rows["member"].iat[0] else Estimate(float(values[0]))
+
+
+def failures(rows: pd.DataFrame) -> tuple[int, int]:
+    """Episodes that failed, and all."""
+    return int(rows["failed"].to_numpy().sum()), len(rows)

@@ -1,0 +1,302 @@
+"""A chart as data: panels of curves over one axis. Pictures and the page of a report draw the same charts."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.signals import Array
+from train.evaluate.environments import Column, TracedSignal
+from train.evaluate.episodes import Evaluation
+from train.evaluate.progress import Curves
+from train.evaluate.statistics import Estimate
+from train.figures.colours import REFERENCE, is_dashed
+
+Cells = Mapping[str, Mapping[float | None, Sequence[Evaluation]]]
+"""Evaluations of every policy by the value of what is swept; None where it is not swept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A curve of a panel.
+
+    Attributes:
+        name: In the legend; empty to stand in none.
+        colour: Its colour.
+        x, y: Its points, (n,) each; y is nan where there is none.
+        dash: solid, dash or dot.
+        band: Ends of the band around it, (n,) each; None without one.
+        width: Width of the line.
+        has_points: Whether its points are marked.
+        fails: Whether a cross marks its end.
+    """
+
+    name: str
+    colour: str
+    x: Array
+    y: Array
+    dash: str = "solid"
+    band: tuple[Array, Array] | None = None
+    width: float = 1.4
+    has_points: bool = False
+    fails: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A panel of a chart.
+
+    Attributes:
+        label: Title of its axis, with the unit.
+        curves: What it shows.
+        limits: Ends of its axis; None for those of the curves.
+        is_log: Whether its axis is logarithmic.
+        height: Its share of the height.
+    """
+
+    label: str
+    curves: Sequence[Curve]
+    limits: tuple[float, float] | None = None
+    is_log: bool = False
+    height: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Failing:
+    """Where a policy fails: the values, and whether in all episodes."""
+
+    name: str
+    colour: str
+    x: Sequence[float]
+    is_all: Sequence[bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Panels one below the other over one axis.
+
+    Attributes:
+        title: Of a picture.
+        label: Title of the axis that the panels share.
+        panels: From the top.
+        shaded: Beginnings and ends of what is shaded.
+        shade_name: Name of that in the legend.
+        ticks: Values of a logarithmic axis; None for a linear one.
+        failing: Policies that fail somewhere, each in a row on top.
+        failure: Title of these rows.
+        width, height: Size of a picture [in].
+        panel_height: Height of a panel on a page [px].
+    """
+
+    title: str
+    label: str
+    panels: Sequence[Panel]
+    shaded: Sequence[tuple[float, float]] = ()
+    shade_name: str = "single support"
+    ticks: Sequence[float] | None = None
+    failing: Sequence[Failing] = ()
+    failure: str = ""
+    width: float = 9.0
+    height: float = 5.2
+    panel_height: int = 165
+
+
+def time_chart(
+    policies: Mapping[str, Sequence[Evaluation]],
+    signals: Sequence[TracedSignal],
+    colours: Mapping[str, str],
+    most_points: int | None = None,
+) -> Chart:
+    """Signals of the first episodes over time; of several training seeds the median and the band around all.
+
+    The scale is that of the walks that go on: what happens shortly before a fall leaves the chart.
+
+    Args:
+        policies: Evaluations with a trace, by title of the policy.
+        signals: A panel for each.
+        colours: Of the policies.
+        most_points: Points of a curve, about; None for all.
+    """
+    traces = [e.trace for own in policies.values() for e in own]
+    longest = max(traces, key=lambda trace: len(trace["time_s"]))
+    time_s = longest["time_s"]
+    stride = 1 if most_points is None else max(1, -(-len(time_s) // most_points))
+    panels = []
+    for signal in signals:
+        curves = []
+        for title, own in policies.items():
+            curves.append(_median_curve(title, colours[title], own, signal, time_s, stride))
+        if signal.reference is not None:
+            reference = signal.scale * longest[signal.reference][::stride]
+            curves.append(Curve("reference", REFERENCE, time_s[::stride], reference, dash="dash", width=1.1))
+        limits = _limits([e for own in policies.values() for e in own], signal)
+        panels.append(Panel(signal.label, curves, limits))
+    shaded = intervals(longest["single_support"], time_s) if "single_support" in longest else []
+    return Chart("", "time [s]", panels, shaded=shaded)
+
+
+def _median_curve(
+    title: str,
+    colour: str,
+    own: Sequence[Evaluation],
+    signal: TracedSignal,
+    time_s: Array,
+    stride: int,
+) -> Curve:
+    length = max(len(e.trace["time_s"]) for e in own)
+    values = np.full((len(own), length), np.nan)
+    for row, e in zip(values, own, strict=True):
+        row[: len(e.trace[signal.name])] = signal.scale * e.trace[signal.name]
+    low, middle, high = spread(values[:, ::stride])
+    return Curve(
+        title,
+        colour,
+        time_s[:length:stride],
+        middle,
+        dash="dash" if is_dashed(title) else "solid",
+        band=(low, high) if len(own) > 1 else None,
+        fails=len(own) == 1 and own[0].first_failed,
+    )
+
+
+def _limits(evaluations: Sequence[Evaluation], signal: TracedSignal) -> tuple[float, float]:
+    """Range of a signal and its reference, shortly before a fall left out, with a margin."""
+    names = [name for name in (signal.name, signal.reference) if name is not None]
+    values = np.concatenate([e.trace[name][e.is_steady] for e in evaluations for name in names])
+    values = signal.scale * values[np.isfinite(values)]
+    if len(values) == 0:
+        return -1.0, 1.0
+    margin = 0.06 * float(np.ptp(values)) + 1e-6
+    return float(values.min()) - margin, float(values.max()) + margin
+
+
+def intervals(mask: Array, time: Array) -> list[tuple[float, float]]:
+    """Beginnings and ends of the times in which a mask is true, (n,) each."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0.0], mask > 0.5, [0.0]])))
+    return [(float(time[begin]), float(time[end - 1])) for begin, end in edges.reshape(-1, 2)]
+
+
+def spread(values: Array) -> tuple[Array, Array, Array]:
+    """Least, median and most over the first axis, nan where there is nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns of nothing but nan
+        return np.nanmin(values, axis=0), np.nanmedian(values, axis=0), np.nanmax(values, axis=0)
+
+
+def median(cell: Sequence[Evaluation], column: Column) -> Estimate:
+    """Median over the episodes of a cell that did not fail [SI]; nan where all did."""
+    values = np.concatenate([e.values(column.metric) for e in cell])
+    return Estimate(float(np.median(values)) if len(values) else float("nan"))
+
+
+def sweep_chart(
+    cells: Cells,
+    columns: Sequence[Column],
+    label: str,
+    colours: Mapping[str, str],
+    statistic: Callable[[Sequence[Evaluation], Column], Estimate] = median,
+) -> Chart:
+    """Scores over what is swept, a curve per policy with its interval, or a level; on top, who fails where.
+
+    Args:
+        cells: Evaluations by policy and value.
+        columns: A panel for each.
+        label: Title of the axis.
+        colours: Of the policies.
+        statistic: Over the episodes of a cell [SI].
+    """
+    values = sorted({value for own in cells.values() for value in own if value is not None})
+    panels = []
+    for column in columns:
+        curves = []
+        for title, own in cells.items():
+            is_level = None in own
+            x = np.array([values[0], values[-1]] if is_level else [value for value in values if value in own])
+            found = [statistic(own[None if is_level else value], column).scaled(column.scale) for value in x.tolist()]
+            ends = np.array([estimate.ends for estimate in found]).T
+            curve = Curve(
+                title,
+                colours[title],
+                x,
+                np.array([estimate.value for estimate in found]),
+                width=1.6,
+            )
+            if is_level:
+                curves.append(replace(curve, dash="dot"))
+                continue
+            band = (ends[0], ends[1]) if any(estimate.has_interval for estimate in found) else None
+            dash = "dash" if is_dashed(title) else "solid"
+            curves.append(replace(curve, dash=dash, band=band, has_points=True))
+        panels.append(Panel(column.label, curves, is_log=True, height=2.2))
+    failing = [_failing(title, colours[title], own, values) for title, own in cells.items()]
+    failing = [policy for policy in failing if policy.x]
+    first = next(e for own in cells.values() for cell in own.values() for e in cell).condition
+    height = 2.2 * len(columns) + 1.6 + (0.16 * len(failing) + 0.2 if failing else 0.0)
+    return Chart(
+        "",
+        label,
+        panels,
+        ticks=values,
+        failing=failing,
+        failure=first.environment.failure,
+        width=8.0,
+        height=height,
+        panel_height=300,
+    )
+
+
+def _failing(
+    title: str,
+    colour: str,
+    own: Mapping[float | None, Sequence[Evaluation]],
+    values: Sequence[float],
+) -> Failing:
+    """Values at which a policy fails; a level fails at all of them."""
+    shares = {}
+    for value in values:
+        cell = own.get(value, own.get(None, ()))
+        failed = sum(e.num_failed for e in cell)
+        if failed:
+            shares[value] = failed == sum(len(e.episodes) for e in cell)
+    return Failing(title, colour, list(shares), list(shares.values()))
+
+
+def learning_chart(learning: Mapping[str, Curves], columns: Sequence[Column], colours: Mapping[str, str]) -> Chart:
+    """Share of the base's score on the way of a training: median over training seeds, band from least to most."""
+    panels = []
+    for column in columns:
+        curves = []
+        for title, found in learning.items():
+            low, middle, high = spread(found.ratios[column.metric])
+            x = found.decisions
+            band = (low, high) if len(found.ratios[column.metric]) > 1 else None
+            curves.append(Curve(title, colours[title], x, middle, band=band, width=2.0, has_points=True))
+        ends = np.array([0.0, max(curve.x[-1] for curve in curves)])
+        top = max(float(np.nanmax(found.ratios[column.metric], initial=1.0)) for found in learning.values())
+        curves.append(Curve("", REFERENCE, ends, np.ones(2), dash="dot", width=1.0))
+        panels.append(Panel(f"{column.title}, share of the base's", curves, (0.0, 1.08 * min(top, 2.0))))
+    return Chart("", "decisions of all worlds", panels, panel_height=260)
+
+
+def trials_chart(trials: Sequence[Any], columns: Sequence[Column], title: str) -> Chart:
+    """Metrics over the trials of a policy that learns on the robot: a thin line per robot, and their mean.
+
+    Args:
+        trials: `baselines.adaptation.iterative.Trial`, in order, the first without offsets.
+        columns: Metrics, a panel for each.
+        title: Of the chart.
+    """
+    numbers = np.array([trial.number for trial in trials])
+    failed = np.array([trial.failed for trial in trials])
+    panels = []
+    for column in columns:
+        values = column.scale * np.array([[own[column.metric] for own in trial.metrics] for trial in trials])
+        values[failed] = np.nan
+        counts = np.isfinite(values).sum(axis=1)
+        means = np.where(counts > 0, np.nansum(values, axis=1) / np.maximum(counts, 1), np.nan)
+        curves = [Curve("", "#8fbbd9", numbers, robot, width=0.9) for robot in values.T]
+        curves.append(Curve("mean", "#2a6f97", numbers, means, width=2.0, has_points=True))
+        panels.append(Panel(column.label, curves, (0.0, 1.05 * float(np.nanmax(values, initial=1e-9)))))
+    return Chart(title, "trials learned from", panels, width=7.0, height=2.6 * len(columns))

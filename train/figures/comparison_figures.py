@@ -1,0 +1,217 @@
+"""The pictures of a comparison: which are drawn, what they show, and what their files are called."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from train.evaluate.conditions import Condition
+from train.evaluate.environments import TracedSignal
+from train.evaluate.episodes import Evaluation, group_by
+from train.evaluate.maps import HeatMap
+from train.evaluate.rollout import make_vector_env
+from train.figures.chart import Cells, Chart, Curve, sweep_chart, time_chart
+from train.figures.colours import policy_colours
+from train.figures.map_plots import draw_map
+from train.figures.plots import draw_chart, draw_overview
+from train.figures.testbed_plots import draw_static_errors
+
+_MIN_SWEPT_REFERENCES = 3
+"""From so many references with a number of their own on, the scores are drawn against it."""
+_PAPER_BOUND_MRAD = 10.0
+"""The pelvis error stays below it with compensation in the paper, in its two gaits."""
+_PAPER_FIGURES = {
+    ("pelvis", "24 s"): 7,
+    ("pelvis", "3 s"): 8,
+    ("zmp", "24 s"): 9,
+    ("zmp", "3 s"): 10,
+}
+_PAPER_SCENARIOS = ("ideal", "nominal")
+_PELVIS = tuple(TracedSignal(name, f"pelvis_{name}", "mrad", 1e3) for name in ("roll", "pitch"))
+_ZMP = (
+    TracedSignal("x, forward", "zmp_x", "mm", 1e3, reference="zmp_reference_x"),
+    TracedSignal("y, to the left", "zmp_y", "mm", 1e3, reference="zmp_reference_y"),
+)
+_LINK = (
+    TracedSignal("q_ref", "reference_angle", "rad", 1.0),
+    TracedSignal("link error q_ref − q", "link_error", "mrad", 1e3),
+)
+
+
+def draw_figures(
+    evaluations: Sequence[Evaluation],
+    folder: Path,
+    policies: Sequence[str] = (),
+    swept: str | None = None,
+) -> list[Path]:
+    """Draw the figures of a comparison.
+
+    Args:
+        evaluations: All cells, the training seeds of a residual put together.
+        folder: Where to.
+        policies: Policies of the time series, all if empty.
+        swept: Title of the axis of swept options; None without a sweep.
+    """
+    cells = cells_together(evaluations)
+    if swept is not None:
+        return [draw_sweep(own, by_option(own), swept, folder / f"sweep_{_stem(own[0])}.png") for own in cells]
+    known = evaluations[0].condition.environment
+    files = [draw_overview(evaluations, known.overview, folder / "overview.png")]
+    for scenario in swept_scenarios(evaluations):
+        own = [e for e in evaluations if e.condition.scenario == scenario]
+        path = folder / f"sweep_{_safe(scenario)}.png"
+        files.append(draw_sweep(own, by_reference(own), f"{known.quantity} [s]", path))
+    for group in cells:
+        shown = [e for e in group if not policies or e.condition.policy.title in policies]
+        for name in known.figures:
+            files += draw_figure(name, shown, folder)
+    return files
+
+
+def draw_maps(maps: Sequence[HeatMap], folder: Path) -> list[Path]:
+    """Draw the maps of a comparison, a picture per scenario, motion and metric."""
+    return [draw_map(found, folder / f"map_{_safe(f'{found.title}_{found.column.metric}')}.png") for found in maps]
+
+
+def draw_figure(name: str, evaluations: Sequence[Evaluation], folder: Path) -> list[Path]:
+    """Draw a figure of one reference and scenario, if there is something to show.
+
+    Args:
+        name: Name in the environment's description.
+        evaluations: The policies.
+        folder: Where to.
+    """
+    if not evaluations or (name == "static" and evaluations[0].points is None):
+        return []
+    return [_FIGURES[name](evaluations, folder / f"{figure_name(name, evaluations[0])}.png")]
+
+
+def figure_name(name: str, evaluation: Evaluation) -> str:
+    """Name of a figure's file; the paper's conditions have the number of its figure in front."""
+    number = paper_figure(name, evaluation.condition)
+    return f"{'' if number is None else f'fig{number}_'}{name}_{_stem(evaluation)}"
+
+
+def paper_figure(name: str, condition: Condition) -> int | None:
+    """Number of the paper's figure that a picture of a condition stands beside, if there is one."""
+    is_like_the_paper = condition.scenario in _PAPER_SCENARIOS
+    return _PAPER_FIGURES.get((name, condition.reference_name)) if is_like_the_paper else None
+
+
+def cells_together(evaluations: Sequence[Evaluation]) -> list[list[Evaluation]]:
+    """Evaluations of the same reference and scenario together."""
+    return list(group_by(evaluations, lambda e: (e.condition.reference_name, e.condition.scenario)).values())
+
+
+def by_option(evaluations: Sequence[Evaluation]) -> Cells:
+    """Evaluations of every policy by the value of the swept option; None for a policy that was not swept."""
+    return {
+        title: group_by(own, lambda e: next(iter(e.condition.swept.values()), None))
+        for title, own in group_by(evaluations, lambda e: e.condition.policy.title).items()
+    }
+
+
+def by_reference(evaluations: Sequence[Evaluation]) -> Cells:
+    """Evaluations of every policy by the number of the reference, such as the step period [s]."""
+    numbered = [e for e in evaluations if e.condition.number is not None]
+    return {
+        title: group_by(own, lambda e: e.condition.number)
+        for title, own in group_by(numbered, lambda e: e.condition.policy.title).items()
+    }
+
+
+def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
+    """Scenarios in which the references that are played are points of one axis."""
+    by_scenario = group_by(evaluations, lambda e: e.condition.scenario)
+    return [scenario for scenario, own in by_scenario.items() if has_swept_references(own)]
+
+
+def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
+    """Whether the references are points of one axis: enough of them have a number, and each one of its own."""
+    numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
+    known = [number for number in numbers.values() if number is not None]
+    return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)
+
+
+def draw_sweep(evaluations: Sequence[Evaluation], cells: Cells, label: str, path: Path) -> Path:
+    """Medians against a swept value, a curve per policy; on top, who fails where."""
+    condition = evaluations[0].condition
+    references = {e.condition.reference_name for e in evaluations}
+    title = f"scenario {condition.scenario}"
+    if len(references) == 1:
+        title = f"{condition.environment.title(*references)}, {title}"
+    chart = sweep_chart(cells, condition.environment.swept, label, policy_colours(list(cells)))
+    return draw_chart(replace(chart, title=title[0].upper() + title[1:]), path)
+
+
+def draw_time_series(evaluations: Sequence[Evaluation], path: Path) -> Path:
+    """Reference and link error over time, one line per policy."""
+    condition = evaluations[0].condition
+    chart = _over_time(evaluations, _LINK)
+    reference, error = chart.panels
+    once = replace(reference.curves[0], name="", colour="#333333", dash="solid")
+    panels = [replace(reference, curves=[once]), replace(error, height=2.0)]
+    title = f"{condition.reference_name}, scenario {condition.scenario}"
+    return draw_chart(replace(chart, panels=panels, title=title, width=8.0, height=5.0), path)
+
+
+def draw_pelvis(evaluations: Sequence[Evaluation], path: Path) -> Path:
+    """Roll and pitch of the pelvis, which should be level, one line per policy, as Figs. 7 and 8 of the paper."""
+    chart = _over_time(evaluations, _PELVIS, _walk_title(evaluations, "pelvis", "Pelvis error"))
+    if paper_figure("pelvis", evaluations[0].condition) is None:
+        return draw_chart(chart, path)
+    panels = []
+    for panel in chart.panels:
+        ends = panel.curves[0].x[[0, -1]]
+        bounds = [
+            Curve(name, "#777777", ends, np.full(2, bound), dash="dot", width=0.9)
+            for name, bound in (
+                ("paper, compensated: ±10 mrad", _PAPER_BOUND_MRAD),
+                ("", -_PAPER_BOUND_MRAD),
+            )
+        ]
+        low, high = panel.limits or (0.0, 0.0)
+        limits = (min(low, -1.2 * _PAPER_BOUND_MRAD), max(high, 1.2 * _PAPER_BOUND_MRAD))
+        panels.append(replace(panel, curves=[*panel.curves, *bounds], limits=limits))
+    return draw_chart(replace(chart, panels=panels), path)
+
+
+def draw_zmp(evaluations: Sequence[Evaluation], path: Path) -> Path:
+    """Zero moment point with its reference, one line per policy, as Figs. 9 and 10 of the paper."""
+    return draw_chart(_over_time(evaluations, _ZMP, _walk_title(evaluations, "zmp", "Zero moment point")), path)
+
+
+def _over_time(evaluations: Sequence[Evaluation], signals: Sequence[TracedSignal], title: str = "") -> Chart:
+    policies = {e.condition.policy.title: [e] for e in evaluations}
+    return replace(time_chart(policies, signals, policy_colours(list(policies))), title=title)
+
+
+def _walk_title(evaluations: Sequence[Evaluation], name: str, subject: str) -> str:
+    condition = evaluations[0].condition
+    number = paper_figure(name, condition)
+    beside = "" if number is None else f" (cf. Fig. {number} of the paper)"
+    reference = condition.environment.title(condition.reference_name)
+    return f"{subject}, {reference}, scenario {condition.scenario}{beside}"
+
+
+def _stem(evaluation: Evaluation) -> str:
+    return _safe(f"{evaluation.condition.reference_name}_{evaluation.condition.scenario}")
+
+
+def _safe(text: str) -> str:
+    return re.sub(r"[^\w.=+-]+", "_", text)
+
+
+def _draw_static(evaluations: Sequence[Evaluation], path: Path) -> Path:
+    model = make_vector_env(evaluations[0].condition, 1).unwrapped.assumed_model
+    return draw_static_errors(evaluations, model, path)
+
+
+_FIGURES: dict[str, Callable[[Sequence[Evaluation], Path], Path]] = {
+    "time": draw_time_series,
+    "static": _draw_static,
+    "pelvis": draw_pelvis,
+    "zmp": draw_zmp,
+}

@@ -1,0 +1,343 @@
+"""Tables of results, and their one outlet: for the terminal, as Markdown, as CSV and as HTML.
+
+Texts of a table are plain. This outlet escapes them for each format, see `train.runs.escaping`.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import numpy as np
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from elastic_env.core.errors import missing_extra
+from train.evaluate.environments import Column
+from train.evaluate.statistics import Estimate
+from train.figures.colours import NIGHT, VERDICTS
+from train.report.specs import FONT
+from train.runs.escaping import csv_row, markdown_text, script_json, template_value
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+Style = Literal[
+    "",
+    "bold",
+    "small",
+    "failure",
+    "badge",
+    "pooled",
+    "ceiling",
+    "lower",
+    "higher",
+    "none",
+    "unclear",
+]
+
+_ANY_WIDTH = 10_000
+_WORD = re.compile(r"\S+(?: [^\w\s]+)*")
+"""A word, with the signs behind it."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of a cell.
+
+    Attributes: text: Plain text. style: Look of it: bold; small, on a line below; a failure; a
+        badge; or the colour of a verdict. before: Plain text between it and the part before.
+    """
+
+    text: str
+    style: Style = ""
+    before: str = ""
+
+
+Cell = str | tuple[Part, ...]
+
+
+@dataclass(frozen=True)
+class Head:
+    """A column of a table.
+
+    Attributes: title: Its title. unit: Unit of its figures; empty without one. second: Second part
+        of the title, on a line of its own where there is room for lines. is_number: Whether it
+        holds figures, to the right, or words. wraps: Whether its words may stand on several lines
+        of a terminal, but for the longest. leaves: Turn in which it is left out where a terminal
+        has no room: 1 before 2; 0 for never. The last one of
+            those that may leave stays.
+        titles: Whether the title of the table may name its value, if it has but one.
+    """
+
+    title: str
+    unit: str = ""
+    second: str = ""
+    is_number: bool = True
+    wraps: bool = False
+    leaves: int = 0
+    titles: bool = False
+
+    @property
+    def label(self) -> str:
+        """All of the title in one line, with unit."""
+        title = f"{self.title}, {self.second}" if self.second else self.title
+        return f"{title} [{self.unit}]" if self.unit else title
+
+    @property
+    def lines(self) -> str:
+        """The title on a terminal: of figures a line for each word, as there is little room."""
+        if not self.is_number:
+            return self.title
+        title = f"{self.title}," if self.second else self.title
+        return "\n".join(filter(None, [*title.split(), self.second, self.unit]))
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table.
+
+    Attributes:
+        cells: One per column; of the heading of a section the first one alone.
+        kind: A heading of what follows, or a group of scenarios, which stands out.
+        dot: Colour of a dot before a heading; empty for none.
+    """
+
+    cells: tuple[Cell, ...]
+    kind: Literal["", "heading", "group"] = ""
+    dot: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes: heads: Its columns. rows: Its rows. keys: Columns that name a row. Where a terminal
+        or a page repeats them, they stand once, but for the last one. title: Above it on a
+        terminal. subjects: Names before the title. caption: Below it on a terminal. kind: Class of
+        it on a page.
+    """
+
+    heads: tuple[Head, ...]
+    rows: tuple[Row, ...]
+    keys: int = 1
+    title: str = ""
+    subjects: tuple[str, ...] = ()
+    caption: str = ""
+    kind: str = ""
+
+    @classmethod
+    def plain(cls, head: Iterable[str], rows: Iterable[Iterable[str]], words: int = 1, **more: Any) -> "Table":
+        """A table of texts whose first columns hold words and the others figures."""
+        heads = tuple(Head(title, is_number=number >= words) for number, title in enumerate(head))
+        return cls(heads, tuple(Row(tuple(row)) for row in rows), keys=words, **more)
+
+    def column(self, place: int) -> list[str]:
+        """Texts of a column, without headings."""
+        return [plain_text(row.cells[place]) for row in self.rows if row.kind != "heading"]
+
+    def without(self, place: int) -> "Table":
+        """The same without a column."""
+        rows = (
+            row if row.kind == "heading" else replace(row, cells=row.cells[:place] + row.cells[place + 1 :])
+            for row in self.rows
+        )
+        heads = self.heads[:place] + self.heads[place + 1 :]
+        return replace(self, heads=heads, rows=tuple(rows), keys=self.keys - (place < self.keys))
+
+    @property
+    def sparse(self) -> list[Row]:
+        """Rows in which what the row above has already said is empty."""
+        found = []
+        before: tuple[Cell, ...] = ()
+        for row in self.rows:
+            is_heading = row.kind == "heading"
+            said = 0
+            while not is_heading and said < self.keys - 1 and row.cells[: said + 1] == before[: said + 1]:
+                said += 1
+            found.append(replace(row, cells=("",) * said + row.cells[said:]))
+            before = () if is_heading else row.cells
+        return found
+
+
+def plain_text(cell: Cell) -> str:
+    """The text of a cell without looks; what is small is left out."""
+    if isinstance(cell, str):
+        return cell
+    return "".join(part.before + part.text for part in cell if part.style != "small")
+
+
+@overload
+def render(table: Table, to: Literal["terminal"]) -> RichTable: ...
+@overload
+def render(table: Table, to: Literal["markdown", "csv", "html"]) -> str: ...
+def render(table: Table, to: Literal["terminal", "markdown", "csv", "html"]) -> RichTable | str:
+    """A table in a format, with its texts escaped for it."""
+    formats: dict[str, Any] = {
+        "terminal": _terminal,
+        "markdown": _markdown,
+        "csv": _csv,
+        "html": _html,
+    }
+    return formats[to](table)
+
+
+def print_table(table: Table, console: Console, file: str) -> None:
+    """Print a table without the columns that the terminal has no room for, and name those and who has them.
+
+    Args:
+        table: The table.
+        console: The terminal.
+        file: File that has all columns.
+    """
+    shown = table
+    left_out: list[str] = []
+    while not (fitting := _fit(shown, console)):
+        leaving = [place for place, head in enumerate(shown.heads) if head.leaves]
+        if len(leaving) < 2:
+            fitting = _terminal(shown, breaks_words=True)
+            break
+        place = min(leaving, key=lambda place: (shown.heads[place].leaves, -place))
+        head = shown.heads[place]
+        left_out.insert(0, replace(head, unit="").label)
+        shown = shown.without(place)
+    console.print(fitting)
+    if left_out:
+        console.print(f"no room for {'; '.join(left_out)}; {file} has them", style="dim", markup=False)
+
+
+def _fit(table: Table, console: Console) -> RichTable | None:
+    """A table as it has room on a terminal; None where it has none."""
+    options = console.options.update(max_width=_ANY_WIDTH)
+    for form in (table, _with_titles(table)):
+        found = _terminal(form)
+        if console.measure(found, options=options).minimum <= console.width:
+            return found
+    return None
+
+
+def _with_titles(table: Table) -> Table:
+    """A table whose title names what has but one value."""
+    for place, head in reversed(list(enumerate(table.heads))):
+        values = set(table.column(place))
+        if head.titles and len(values) == 1:
+            table = replace(table.without(place), subjects=(*table.subjects, *values))
+    return table
+
+
+def _terminal(table: Table, breaks_words: bool = False) -> RichTable:
+    title = ": ".join(filter(None, [", ".join(table.subjects), table.title]))
+    found = RichTable(
+        title=Text(title) if title else None,
+        caption=Text(table.caption) if table.caption else None,
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    indent = "  " if any(row.kind == "heading" for row in table.rows) else ""
+    for place, head in enumerate(table.heads):
+        texts = [*head.lines.split("\n"), *table.column(place)]
+        pieces = [word for text in texts for word in _WORD.findall(text)] if head.wraps else texts
+        least = max(map(cell_len, pieces), default=0) + (len(indent) if place == 0 else 0)
+        found.add_column(
+            Text(head.lines),
+            justify="right" if head.is_number else "left",
+            vertical="bottom",
+            no_wrap=head.is_number,
+            overflow="fold",
+            min_width=None if breaks_words and not head.is_number else least,
+        )
+    is_first = True
+    for row in table.sparse:
+        is_heading = row.kind == "heading"
+        if not is_first and (is_heading or ("" not in row.cells[: table.keys - 1][:1] and table.keys > 1)):
+            found.add_section()
+        is_first = False
+        cells = [_terminal_cell(cell) for cell in row.cells]
+        cells[0] = cells[0] if is_heading else Text(indent).append(cells[0])
+        found.add_row(*cells, style={"group": "bold", "heading": "italic"}.get(row.kind, ""))
+    return found
+
+
+def _terminal_cell(cell: Cell) -> Text:
+    if isinstance(cell, str):
+        return Text(cell)
+    text = Text()
+    for part in cell:
+        if part.style != "small":
+            text.append(part.before)
+            text.append(part.text, "bold" if part.style == "bold" else None)
+    return text
+
+
+def _markdown(table: Table) -> str:
+    rules = ["---:" if head.is_number else "---" for head in table.heads]
+    lines = [[markdown_text(head.label) for head in table.heads], rules]
+    for row in table.rows:
+        cells = [_markdown_cell(cell) for cell in row.cells]
+        if row.kind == "heading":
+            cells = [f"**{cells[0]}**", *[""] * (len(table.heads) - 1)]
+        lines.append(cells)
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _markdown_cell(cell: Cell) -> str:
+    if isinstance(cell, str):
+        return markdown_text(cell)
+    looks = {
+        "bold": "**{}**",
+        "small": "<br><sub>{}</sub>",
+        "badge": "({})",
+        "ceiling": "({})",
+        "pooled": "({})",
+    }
+    return "".join(part.before + looks.get(part.style, "{}").format(markdown_text(part.text)) for part in cell)
+
+
+def _csv(table: Table) -> str:
+    text = io.StringIO(newline="")
+    rows = ([plain_text(cell) for cell in row.cells] for row in table.rows)
+    csv.writer(text).writerows(map(csv_row, [[head.label for head in table.heads], *rows]))
+    return text.getvalue()
+
+
+def _html(table: Table) -> str:
+    return str(require_jinja2().module.table(table))  # type: ignore[attr-defined]
+
+
+def require_jinja2() -> "Template":
+    """The template of a page, which escapes all that is put into it.
+
+    Raises:
+        MissingExtraError: Jinja2 is not installed.
+    """
+    try:
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    except ImportError:
+        raise missing_extra("jinja2", "report", "writing a report") from None
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        finalize=template_value,
+    )
+    environment.filters.update(script_json=script_json)
+    environment.globals.update(font=FONT, night=NIGHT, verdicts=VERDICTS)
+    return environment.get_template("page.html.j2")
+
+
+def number_interval(estimate: Estimate, column: Column) -> str:
+    """A figure in the unit in which it is shown, with its interval; - where there is none."""
+    if not np.isfinite(estimate.value):
+        return "-"
+    shown = estimate.scaled(column.scale)
+    text = f"{shown.value:.{column.decimals}f}"
+    if shown.low is None or shown.high is None:
+        return text
+    return f"{text} [{shown.low:.{column.decimals}f}, {shown.high:.{column.decimals}f}]"

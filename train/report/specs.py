@@ -1,0 +1,220 @@
+"""Charts of the report as plain specifications for plotly.js: lists, numbers and colours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from elastic_env.core.signals import Array
+from train.evaluate.statistics import Estimate
+from train.figures.chart import Chart, Curve, Failing, Panel
+from train.figures.colours import FRAME, GRID, INK, SHADE
+from train.runs.escaping import chart_text
+
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
+LONGEST_NAME = 34
+"""Letters of a policy that stand beside an axis."""
+_LEGEND_ROW = 150
+"""Letters in a row of a legend."""
+
+Spec = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PageChart:
+    """A chart on a page.
+
+    Attributes:
+        spec: `data` and `layout` for plotly.js.
+        height: Height [px].
+    """
+
+    spec: Spec
+    height: int
+
+
+def page_chart(chart: Chart) -> PageChart:
+    """The panels of a chart one below the other, with a legend on top."""
+    count = len(chart.panels)
+    names = dict.fromkeys(curve.name for panel in chart.panels for curve in panel.curves if curve.name)
+    strip = 24 * len(chart.failing) + 12 if chart.failing else 0
+    height = 130 + chart.panel_height * count + strip
+    top = 1.0 - strip / height if strip else 1.0
+    layout = base_layout(left=76, top=28 + 20 * -(-sum(len(name) + 9 for name in names) // _LEGEND_ROW), bottom=50)
+    data: list[Spec] = []
+    for number, panel in enumerate(chart.panels):
+        axis = nth(number)
+        for curve in panel.curves:
+            data += _curve_traces(curve, axis, is_first=number == 0)
+        low, high = domain(count - 1 - number, count, gap=0.06)
+        layout[f"yaxis{axis}"] = _panel_axis(panel, [top * low, top * high])
+    if chart.failing:
+        axis = nth(count)
+        data += [_failing_trace(policy, row, axis) for row, policy in enumerate(chart.failing)]
+        titles = [chart_text(shorten(policy.name)) for policy in chart.failing]
+        rows = list(range(len(titles)))
+        layout[f"yaxis{axis}"] = base_axis(
+            domain=[min(top + 0.02, 0.99), 1.0],
+            tickvals=rows,
+            ticktext=titles,
+            anchor="x",
+            range=[len(rows) - 0.4, -0.6],
+            showgrid=False,
+        )
+        layout["margin"]["l"] = max(76, 7.4 * max(map(len, titles)) + 20)
+    ticks: Spec = {"showgrid": False}
+    if chart.ticks is not None:
+        values = list(chart.ticks)
+        ticks = {"type": "log", "tickvals": values, "ticktext": [f"{value:g}" for value in values]}
+    layout["xaxis"] = base_axis(chart.label, anchor=f"y{nth(count - 1)}", **ticks)
+    layout["legend"] = {
+        "orientation": "h",
+        "y": 1.0,
+        "yanchor": "bottom",
+        "x": 0.0,
+        "xanchor": "left",
+    }
+    layout["showlegend"] = True
+    layout["hovermode"] = "x unified" if len(names) < 7 else "closest"
+    layout["shapes"] = [_shade(begin, end) for begin, end in chart.shaded]
+    return PageChart({"data": data, "layout": layout}, height)
+
+
+def _panel_axis(panel: Panel, place: Sequence[float]) -> Spec:
+    options: Spec = {"type": "log", "dtick": "D2", "tickformat": "~r"} if panel.is_log else {}
+    if panel.limits is not None:
+        options["range"] = [digits(end) for end in panel.limits]
+    return base_axis(panel.label, domain=list(place), anchor="x", **options)
+
+
+def _curve_traces(curve: Curve, axis: str, is_first: bool) -> list[Spec]:
+    """A line, below it the band around it."""
+    where = {
+        "type": "scatter",
+        "yaxis": f"y{axis}",
+        "legendgroup": curve.name,
+        **_abscissa(curve.x),
+    }
+    line = {
+        **where,
+        "mode": "lines+markers" if curve.has_points else "lines",
+        "y": numbers(curve.y),
+        "name": chart_text(curve.name),
+        "showlegend": is_first and bool(curve.name),
+        "line": {"color": curve.colour, "width": curve.width, "dash": curve.dash},
+    }
+    if curve.has_points:
+        line["marker"] = {"size": 7}
+    if curve.band is None:
+        return [line]
+    hidden = {
+        **where,
+        "mode": "lines",
+        "showlegend": False,
+        "hoverinfo": "skip",
+        "line": {"width": 0},
+    }
+    low, high = curve.band
+    filled = {"fill": "tonexty", "fillcolor": see_through(curve.colour)}
+    return [{**hidden, "y": numbers(low)}, {**hidden, "y": numbers(high), **filled}, line]
+
+
+def _abscissa(x: Array) -> Spec:
+    """Points of the axis; of many that are evenly spaced the first one and the distance, which is shorter."""
+    if len(x) < 20:
+        return {"x": x.tolist()}
+    return {"x0": digits(float(x[0])), "dx": digits(float(x[1] - x[0]))}
+
+
+def _failing_trace(policy: Failing, row: int, axis: str) -> Spec:
+    """Crosses where a policy fails: filled where in all episodes, open where in some."""
+    symbols = ["x" if is_all else "x-open" for is_all in policy.is_all]
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": list(policy.x),
+        "y": [row] * len(policy.x),
+        "yaxis": f"y{axis}",
+        "showlegend": False,
+        "marker": {"symbol": symbols, "size": 9, "color": policy.colour},
+        "hoverinfo": "skip",
+        "name": chart_text(policy.name),
+    }
+
+
+def _shade(begin: float, end: float) -> Spec:
+    place = {"xref": "x", "yref": "paper", "x0": digits(begin), "x1": digits(end), "y0": 0, "y1": 1}
+    return {"type": "rect", **place, "fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+
+
+def shorten(name: str) -> str:
+    """The end of a name that is too long: of a path it is what differs."""
+    return name if len(name) <= LONGEST_NAME else "…" + name[1 - LONGEST_NAME :]
+
+
+def error_bars(estimates: Sequence[Estimate], colour: str) -> Spec:
+    """Intervals around points."""
+    return {
+        "type": "data",
+        "symmetric": False,
+        "array": [digits(e.ends[1] - e.value) for e in estimates],
+        "arrayminus": [digits(e.value - e.ends[0]) for e in estimates],
+        "color": colour,
+        "thickness": 2,
+        "width": 5,
+        "visible": any(e.has_interval for e in estimates),
+    }
+
+
+def base_layout(left: float, top: float, bottom: float) -> Spec:
+    """The layout that all charts have in common, with its margins [px]."""
+    return {
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "font": {"family": FONT, "size": 13, "color": INK},
+        "margin": {"l": left, "r": 10, "t": top, "b": bottom, "pad": 4},
+        "hoverlabel": {"font": {"size": 12, "family": FONT}},
+        "hovermode": "closest",
+    }
+
+
+def base_axis(title: str = "", **options: Any) -> Spec:
+    """An axis."""
+    return {
+        "title": {"text": title, "font": {"size": 13}, "standoff": 8},
+        "gridcolor": GRID,
+        "linecolor": FRAME,
+        "zeroline": False,
+        "ticks": "",
+        "automargin": False,
+        **options,
+    }
+
+
+def domain(number: int, count: int, gap: float) -> list[float]:
+    """Domain of a panel among several."""
+    width = (1.0 - gap * (count - 1)) / count
+    begin = number * (width + gap)
+    return [round(begin, 6), round(min(begin + width, 1.0), 6)]
+
+
+def nth(number: int) -> str:
+    """The number of an axis in plotly: the first has none."""
+    return "" if number == 0 else str(number + 1)
+
+
+def see_through(colour: str) -> str:
+    """A colour that lets through what is behind it."""
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return f"rgba({red},{green},{blue},0.18)"
+
+
+def numbers(values: Array) -> list[float | None]:
+    """Values for plotly, None where there is none."""
+    return [digits(float(value)) if np.isfinite(value) else None for value in values]
+
+
+def digits(value: float) -> float:
+    """A number with the digits that a picture can show; nan stays."""
+    return float(f"{value:.5g}")
