@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from typing_extensions import override
 
-from baselines.compensation.policy import Policy
+from baselines.compensation.policy import Policy, put_rows, select_rows
 from baselines.policies import make
 from baselines.residual.correction import Corrected
-from baselines.residual.features import Features
+from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError, shown
 from elastic_env.core.signals import Array, BoolArray
@@ -41,19 +42,30 @@ class _Deciding(Stateful):
         self.features = Features(self.corrected)
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
         self._base = policy if hasattr(policy, "get_state") else None  # others keep their memory in `state`
+        self._blank = np.zeros((num_worlds, len(env.unwrapped.assumed_model.observation_table)))
         self._state: Any = None
-        self._past: Array | None = None
+        self._past: FeaturesMemory | None = None
+
+    @override
+    def set_state(self, state: dict[str, Any]) -> None:
+        # memories that are built alike, to be filled
+        self._state = self.corrected.begin(self._blank)
+        self._past = self.features.begin(len(self._blank))
+        super().set_state(state)
 
     def begin(self, worlds: BoolArray) -> None:
         """Episodes begin in some worlds, a (num_worlds,) mask."""
-        self._start, self._fresh = self._start | worlds, self._fresh | worlds
+        self._start = self._start | worlds
+        self._fresh = self._fresh | worlds
         if worlds.all():
             self._state = self._past = None
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
         """Features of the coming decision; the measurements count for some worlds only, or for all."""
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
-        self._past = past if worlds is None or self._past is None else np.where(worlds[:, None], past, self._past)
+        if worlds is not None and self._past is not None:
+            past = put_rows(self._past, worlds, select_rows(past, worlds))
+        self._past = past
         self._fresh = np.zeros_like(self._fresh) if worlds is None else self._fresh & ~worlds
         return features
 
@@ -63,13 +75,13 @@ class _Deciding(Stateful):
         self._start = np.zeros_like(self._start)
         return action
 
-    def decided(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
+    def read_residual(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
         """A residual for the observations of its decision as numbers within [−1, 1], out of the mirror."""
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
             raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {shown(residual)}")
         clipped = np.clip(given, -1.0, 1.0)
-        return self.features.turned_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
+        return self.features.turn_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
 
 
 ActsOn = Mapping[str, Bound | None]
@@ -128,7 +140,7 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.decided(self._last[None], action, self.action_space.shape or ())[None]
+        residual = self._deciding.read_residual(self._last[None], action, self.action_space.shape or ())[None]
         total, terminated, truncated, info = 0.0, False, False, {}
         for _ in range(self.settings.decision_period):
             command = self._deciding.act(self._last[None], residual)[0]
@@ -218,7 +230,7 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.decided(self._rows, actions, self.action_space.shape or ())
+        residual = self._deciding.read_residual(self._rows, actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
         features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1

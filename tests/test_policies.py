@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.compensators import GravityCompensator
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import Zero, select_rows
 from baselines.walking.controller import WalkingGains
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -169,7 +169,7 @@ def test_state_of_another_number_of_worlds_is_an_error(name: str) -> None:
     observation, _ = env.reset(seed=0)
     _, state = policy.predict(observation)
     with pytest.raises(ElasticError, match="2, got 1"):
-        policy.predict(observation, (state[0][:1], state[1]))
+        policy.predict(observation, select_rows(state, np.array([True, False])))
 
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
@@ -490,7 +490,7 @@ def test_state_of_the_wrapped_policy_travels_inside() -> None:
     for _ in range(4):
         action, state = policy.predict(observation, state)
         observation, *_ = env.step(action)
-    assert state[1] == {"calls": 4}
+    assert state.inner.state == [{"calls": 4}]
 
 
 @pytest.mark.parametrize(

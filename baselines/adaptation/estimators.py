@@ -10,9 +10,11 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 sensors ρ of pitch is left out: friction hides the bending there. Joints without a link encoder have r_j = 0.
 """
 
-from typing import Protocol
+from abc import abstractmethod
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from typing_extensions import override
 
 from baselines.compensation.measured import DeflectionSensors
 from baselines.estimation.bending import BendingObserver
@@ -31,23 +33,26 @@ _PRIOR_LOADS = 5.0
 
 
 class Estimator(Protocol):
-    """Estimates r from observations."""
+    """Estimates r from observations; its memory is an array or a named tuple, one row per world."""
 
-    memory_width: int
+    @abstractmethod
+    def begin(self, num_worlds: int) -> Any:
+        """Memory before the first estimate."""
 
-    def begin(self, num_worlds: int) -> Array:
-        """Memory before the first estimate, (num_worlds, memory_width)."""
-        ...
-
-    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+    @abstractmethod
+    def estimate(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         """The correction r of every joint, (num_worlds, n) [1], and the new memory."""
-        ...
 
 
-class LegEstimator:
+class EstimatorMemory(NamedTuple):
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the observer."""
+
+    loads: Array
+    observer: Any
+
+
+class LegEstimator(Estimator):
     """r of each leg by motors, foot sensors and IMU, and joint torques where there are any; see the module.
-
-    Memory per world: number and sum of the measured excess loads, then that of the observer.
 
     Args:
         model: Assumed walker.
@@ -55,28 +60,26 @@ class LegEstimator:
     """
 
     def __init__(self, model: WalkerModel, sensors: DeflectionSensors | None = None) -> None:
-        self._observer, self._sensors = BendingObserver(model), sensors
+        self._observer = BendingObserver(model)
+        self._sensors = sensors
         self._axis = np.zeros_like(_AXIS) if sensors is None else _AXIS
-        self.memory_width = 2 + self._observer.memory_width
 
-    def begin(self, num_worlds: int) -> Array:
-        """See `Estimator`."""
-        return np.hstack([np.zeros((num_worlds, 2)), self._observer.begin(num_worlds)])
+    @override
+    def begin(self, num_worlds: int) -> EstimatorMemory:
+        return EstimatorMemory(np.zeros((num_worlds, 2)), self._observer.begin(num_worlds))
 
-    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """See `Estimator`."""
+    @override
+    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, EstimatorMemory]:
         bending = None if self._sensors is None else self._sensors.deflection(rows)
-        seen, kept = self._observer.observe(rows, memory[:, 2:], bending)
-        load, loads = mean_load(memory[:, :2], seen[:, [_LOAD]])
+        seen, observer = self._observer.observe(rows, memory.observer, bending)
+        load, loads = mean_load(memory.loads, seen[:, [_LOAD]])
         error = seen[:, _ERROR].reshape(len(rows), 2, 2)[:, :, self._axis]
         joints = (((1.0 + error) * (1.0 + load[:, :, None]) - 1.0) * _BENDS).reshape(len(rows), -1)
-        return joints, np.hstack([loads, kept])
+        return joints, EstimatorMemory(loads, observer)
 
 
-class EncoderEstimator:
+class EncoderEstimator(Estimator):
     """r of each joint by link encoders; joints that have none take part in the load alone. See the module.
-
-    Memory per world: number and sum of the measured excess loads, then that of the observer.
 
     Args:
         model: Assumed walker.
@@ -84,30 +87,31 @@ class EncoderEstimator:
     """
 
     def __init__(self, model: WalkerModel, sensors: DeflectionSensors) -> None:
-        self._sensors, self._observer = sensors, JointStiffnessObserver(model)
-        table, above = model.observation_table, model.biped.chains_above_feet
-        self._wrench, self._carried = table.group("wrench"), above.mass * model.biped.gravity
-        self.memory_width = 2 + self._observer.memory_width
+        self._sensors = sensors
+        self._observer = JointStiffnessObserver(model)
+        self._wrench = model.observation_table.group("wrench")
+        self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
 
-    def begin(self, num_worlds: int) -> Array:
-        """See `Estimator`."""
-        return np.hstack([np.zeros((num_worlds, 2)), self._observer.begin(num_worlds)])
+    @override
+    def begin(self, num_worlds: int) -> EstimatorMemory:
+        return EstimatorMemory(np.zeros((num_worlds, 2)), self._observer.begin(num_worlds))
 
-    def estimate(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """See `Estimator`."""
+    @override
+    def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, EstimatorMemory]:
         has = self._sensors.has
-        error, kept = self._observer.observe(rows, self._sensors.deflection(rows), has, memory[:, 2:])
+        error, observer = self._observer.observe(rows, self._sensors.deflection(rows), has, memory.observer)
         force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
-        load, loads = mean_load(memory[:, :2], force.sum(axis=1, keepdims=True) / self._carried - 1.0)
-        return (1.0 + has * error) * (1.0 + load) - 1.0, np.hstack([loads, kept])
+        load, loads = mean_load(memory.loads, force.sum(axis=1, keepdims=True) / self._carried - 1.0)
+        return (1.0 + has * error) * (1.0 + load) - 1.0, EstimatorMemory(loads, observer)
 
 
-def mean_load(memory: Array, excess: Array) -> tuple[Array, Array]:
+def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:
     """Mean excess load of the feet, (num_worlds, 1) [1], and the new number and sum of measurements.
 
     Args:
         memory: Number and sum, (num_worlds, 2).
         excess: Measured over assumed load less one, (num_worlds, 1) [1].
+        prior: Number of measurements that the assumed load counts for.
     """
     memory = memory + np.hstack([np.ones_like(excess), excess])
-    return memory[:, 1:] / (_PRIOR_LOADS + memory[:, :1]), memory
+    return memory[:, 1:] / (prior + memory[:, :1]), memory

@@ -41,10 +41,6 @@ class FixedGravity:
         """Itself."""
         return self
 
-    def level_and_tilted(self, rows: Array) -> "tuple[FixedGravity, FixedGravity]":  # noqa: ARG002  a walker's
-        """Itself twice: no pelvis tilts."""
-        return self, self
-
 
 class FixedDynamics:
     """Inverse dynamics of a robot on a fixed base."""
@@ -132,11 +128,11 @@ class HingeTorque:
         self._inertia = body.inverse_dynamics(zero, zero, np.ones(1)) - self._a
 
     def gravity_torque(self, q: Array) -> Array:
-        """See `GravityModel`."""
+        """τ_g, (..., 1) [rad] to (..., 1) [N·m]."""
         return self._a * np.cos(q) + self._b * np.sin(q)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """See `GravityModel`."""
+        """∂τ_g/∂q, (..., 1) [rad] to (..., 1, 1) [N·m/rad]."""
         return (self._b * np.cos(q) - self._a * np.sin(q))[..., None]
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  as of a `RigidBody`

@@ -40,13 +40,10 @@ class Ramp:
         steps = np.arange(np.ceil(self._duration / self._period_s) + 2.0)
         self.table = self.share(steps[: int(np.argmax(self.is_over(steps))) + 1])
 
-    def after(self, steps: Array) -> Array:
-        """Share after a whole number of control steps, elementwise: `share`, looked up."""
-        return self.table.take(steps.astype(np.intp), mode="clip")
-
     def share(self, steps: Array) -> Array:
         """Share after a number of control steps, elementwise."""
-        time, each = steps * self._period_s, self._duration - self._delay
+        time = steps * self._period_s
+        each = self._duration - self._delay
         return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 
     def is_over(self, steps: Array) -> BoolArray:

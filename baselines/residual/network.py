@@ -6,10 +6,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from baselines.residual.residual_kernels import affine
+from elastic_env.core.compiled import compiled
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.signals import Array
 
+Single = npt.NDArray[np.float32]
 Tensors = Mapping[str, npt.NDArray[Any]]
 """`mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ..."""
 
@@ -115,3 +116,17 @@ class Network:
                 x = self._activation(x)
         x = np.tanh(x) if self._output == "tanh" else np.clip(x, -1.0, 1.0)
         return x.astype(np.float64)
+
+
+@compiled
+def affine(rows: Single, W: Single, b: Single) -> Single:
+    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up in the same order."""
+    out = np.empty((len(rows), len(b)), dtype=np.float32)
+    for row in range(len(rows)):
+        for j in range(len(b)):
+            out[row, j] = b[j]
+        for i in range(W.shape[0]):  # along the outputs, whose sums are apart, the processor works on several at once
+            x = rows[row, i]
+            for j in range(len(b)):
+                out[row, j] += x * W[i, j]
+    return out

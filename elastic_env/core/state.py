@@ -105,5 +105,7 @@ def given(value: Any, state: Any) -> Any:
     if isinstance(state, list):
         old = value if isinstance(value, list | tuple) and len(value) == len(state) else [None] * len(state)
         parts = [given(mine, part) for mine, part in zip(old, state, strict=True)]
-        return tuple(parts) if isinstance(value, tuple) else parts
+        if isinstance(value, tuple):
+            return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+        return parts
     return state
