@@ -183,7 +183,7 @@ class PlannedTorque:
         """The torque at the control steps of observations, (num_worlds, m); `gravity` is the static one, if known."""
         plan = self._model.plan
         row = np.rint(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
-        torque = plan.torque[np.minimum(np.maximum(row, 0), plan.num_steps)]
+        torque = plan.torque.take(row, axis=0, mode="clip")
         return BoundPlannedTorque(torque, rows[:, self._reference], gravity or self._gravity.at(rows))
 
 

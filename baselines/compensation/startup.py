@@ -10,7 +10,7 @@ Control 112(1).
 
 import numpy as np
 
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.sway import sway_frequencies
 from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
@@ -46,7 +46,7 @@ class Ramp:
         each = self._duration - self._delay
         return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 
-    def is_over(self, steps: Array) -> BoolArray:
+    def is_over(self, steps: Array | IntArray) -> BoolArray:
         """Whether the compensation is complete."""
         return steps * self._period_s >= self._duration
 

@@ -101,15 +101,14 @@ class Features:
             (num_worlds, width), and the memory.
         """
         n = len(rows)
+        begun = self.begin(n)
         if memory is None:
-            memory = self.begin(n)
             fresh = np.ones_like(fresh)
-        elif fresh.any():
-            memory = put_rows(memory, fresh, select_rows(self.begin(n), fresh))
-        observed = [source.observe(rows, own) for source, own in zip(self._sources, memory.sources, strict=True)]
+        kept: FeaturesMemory = begun if memory is None else put_rows(memory, fresh, select_rows(begun, fresh))
+        observed = [source.observe(rows, own) for source, own in zip(self._sources, kept.sources, strict=True)]
         seen = np.hstack([np.zeros((n, 0)), *(values for values, _ in observed)])
         measured = seen[:, self._measured]
-        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), memory.past)
+        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), kept.past)
         parts = [seen]
         if self._acts:
             parts.append(self._corrected.base_action(rows, state, episode_start).astype(np.float64))

@@ -21,13 +21,14 @@ re-taken at every support change. The center of mass in it follows from joint an
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from typing_extensions import override
 
 from baselines.compensation.contact_torque import shifted_shares
-from baselines.compensation.policy import BatchPolicy, PolicyInputs, Records, WalkView
+from baselines.compensation.policy import NO_INPUTS, ONE_WORLD, BatchPolicy, PolicyInputs, Records, WalkView
 from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share, move_pelvis
 from elastic_env.core.compiled import compiled
 from elastic_env.core.config import Model, quantity
@@ -282,6 +283,8 @@ def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> A
 
 def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     """Inputs as rows of `INPUTS`, (num_worlds,)."""
+    if inputs is NO_INPUTS or inputs is ONE_WORLD:
+        return _none(num_worlds)
     dense = np.zeros(num_worlds, INPUTS)
     if inputs.zmp is not None:
         dense["zmp"] = inputs.zmp
@@ -296,6 +299,12 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     if inputs.deflection is not None:
         dense["deflection"] = inputs.deflection.reshape(-1, 2, 6)
     return dense
+
+
+@lru_cache
+def _none(num_worlds: int) -> Records:
+    """No inputs, which the kernel does not change."""
+    return np.zeros(num_worlds, INPUTS)
 
 
 def _share(period_s: float, time_constant_s: float) -> float:
