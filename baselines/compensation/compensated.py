@@ -119,9 +119,9 @@ class Compensated(PolicyAround):
 
     def _begin_shifted(self, rows: Array, memory: CompensatedMemory) -> Any:
         """Memory of the compensator, begun under the shifted plan where an episode begins."""
-        fresh = memory.steps[:, 0] == 0
-        if not fresh.any():
+        if np.count_nonzero(memory.steps) == len(rows):
             return memory.compensator
+        fresh = memory.steps[:, 0] == 0
         begun = self.compensator.at(rows).begin(self.view.motion(rows))
         return put_rows(memory.compensator, fresh, select_rows(begun, fresh))
 

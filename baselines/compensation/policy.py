@@ -182,6 +182,18 @@ class Zero(BatchPolicy):
         super().__init__(table, 0.0)  # without memory it does not ask where episodes begin
 
     @override
+    def predict(
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+        inputs: PolicyInputs = NO_INPUTS,
+    ) -> tuple[Action, Any]:
+        """Zero offset, (..., n) [rad]: it reads nothing of an observation, so it asks nothing of it."""
+        return np.zeros((*observation.shape[:-1], self.view.num_joints), dtype=np.float32), None
+
+    @override
     def begin(self, rows: Array) -> None:
         return None
 

@@ -205,8 +205,9 @@ class WalkingController(BatchPolicy):
         observed = self._walk_view.fields(rows)
         com, soles = self._local_frame(rows)
         action = np.empty((len(rows), 12))
-        now = memory.copy()
-        steps = np.empty(len(rows), dtype=np.int64)
+        now = np.empty(len(rows), MEMORY)
+        coming = np.empty(len(rows), dtype=np.int64)
+        pelvis = np.empty((len(rows), 2))
         is_moved = control(
             controller=self._constants,
             plan=self._plan,
@@ -218,13 +219,12 @@ class WalkingController(BatchPolicy):
             inputs=_dense(inputs, len(rows)),
             before=memory,
             now=now,
-            steps=steps,
+            coming=coming,
+            pelvis=pelvis,
             action=action,
         )
         if is_moved:
-            shift = now["planned"] / self._constants["per_pelvis"]
-            coming = np.minimum(steps + 1, len(self._stances.rows) - 1)
-            move_pelvis(*self._stances, steps=coming, shift=shift, offset=action)
+            move_pelvis(*self._stances, steps=coming, shift=pelvis, offset=action)
         return action.astype(np.float32), now
 
     def _local_frame(self, rows: Array) -> tuple[Array, Array]:
@@ -324,10 +324,11 @@ def control(
     inputs: Any,
     before: Any,
     now: Any,
-    steps: IntArray,
+    coming: IntArray,
+    pelvis: Array,
     action: Array,
 ) -> bool:
-    """Offsets of the joints, and the memory after a control step; whether the planned center of mass is shifted.
+    """Offsets of the joints, and the memory after a control step; whether the pelvis is shifted.
 
     Args:
         controller: Row of `CONTROLLER`, (1,).
@@ -340,7 +341,8 @@ def control(
         inputs: Rows of `INPUTS`, (n,).
         before: Rows of `MEMORY`, (n,).
         now: The same after the control step, to be filled.
-        steps: Rows of the plan, to be filled, (n,).
+        coming: Rows of the plan at the end of the control period, to be filled, (n,).
+        pelvis: Shift of the planned pelvis, to be filled, (n, 2) [m].
         action: To be filled, (n, 12) [rad].
     """
     constants = controller[0]
@@ -350,13 +352,15 @@ def control(
         own = now[world]
         last = before[world]
         given = inputs[world]
-        steps[world] = int(min(max(np.rint(shown.clock[0] / constants.period_s) - 1.0, 0.0), len(plan) - 1.0))
-        planned = plan[steps[world]]
+        row = int(min(max(np.rint(shown.clock[0] / constants.period_s) - 1.0, 0.0), len(plan) - 1.0))
+        coming[world] = min(row + 1, len(plan) - 1)
+        planned = plan[row]
         own.steps = last.steps + 1.0
         ramped = ramp[int(min(own.steps, len(ramp) - 1.0))]
         for i in range(2):
             own.following[i] = follow_zmp(last.following[i], given.zmp[i], constants.following_share)
             own.planned[i] = ramped * (own.following[i] + given.com[i])
+            pelvis[world, i] = own.planned[i] / constants.per_pelvis[i]
             is_shifted = is_shifted or own.planned[i] != 0.0
         weigh(constants, shown, last, own)
         share = planned.share if len(shares) == 0 else shares[world]

@@ -128,7 +128,7 @@ class PostureFeedback(PolicyAround):
             inputs = inputs._replace(posture_gain=None)
         action, inner = self.policy.act(rows, memory.inner, inputs)
         total = action.astype(np.float64)
-        feedback = memory.feedback.copy()
+        feedback = np.empty(len(rows), FEEDBACK)
         hold_posture(
             gains=self._gains,
             observed=self._walk_view.fields(rows),
