@@ -68,26 +68,26 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | name | on the testbed | on the walker |
     |---|---|---|
     | `zero` | plays the reference back | the same |
-    | `uncompensated` | the same | walking controller alone, which takes motors for links |
+    | `uncompensated` | the same | walking controller alone; it takes motors for links |
     | `input` | Eq. 9 on the command, Eq. 12 (or Newton) on the encoder | Eq. 9 around the controller |
-    | `input_output` | - | also Eq. 12: the controller sees the estimated links |
-    | `input_wrench` | - | the estimate takes the measured foot wrenches instead of the planned load share |
-    | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
-    | `friction` | `dynamic`, and the model's Coulomb friction fed forward | - |
-    | `disturbance_observer` | `friction`, and the torque that the link's IMU shows to be missing | - |
-    | `adaptive` | - | `input_output` with the stiffness of each leg adapted online |
-    | `posture` | - | `input_output` with the pelvis' attitude fed back to the hips |
-    | `adaptive_posture` | - | both: the strongest with the standard sensors |
-    | `torque_sensor` | - | deflections by joint torque sensors, K⁻¹ τ_J |
-    | `link_encoder` | `dynamic`, the K of each joint adapted by link encoders | deflections by link encoders |
-    | `hip_sensor` | - | the same at the hips alone |
-    | `thormang` | - | what this robot's published controller does: hip roll in single support, feet by IMU and wrench |
-    | `talos` | - | the controller, its hip rolls led by their measured torque, as TALOS' published one does |
-    | `iterative` | `input`, offsets learned on this robot before | `adaptive_posture`, likewise: see below |
-    | `iterative:PATH` | what it has learned once, from its folder | the same |
+    | `input_output` | – | and Eq. 12: the controller sees the estimated links |
+    | `input_wrench` | – | the estimate takes the measured foot wrenches, not the planned share |
+    | `dynamic` | full joint torque with D; servo with B inverted | the same, links as `input_wrench` |
+    | `friction` | `dynamic`, and the model's Coulomb friction fed forward | – |
+    | `disturbance_observer` | `friction`, and the torque that the link's IMU finds missing | – |
+    | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
+    | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
+    | `adaptive_posture` | – | both: the strongest with the standard sensors |
+    | `torque_sensor` | – | deflections by joint torque sensors, K⁻¹ τ_J |
+    | `link_encoder` | `dynamic`, K of each joint by link encoders | deflections by link encoders |
+    | `hip_sensor` | – | the same at the hips alone |
+    | `thormang` | – | this robot's published controller: hip roll, feet by IMU and wrench |
+    | `talos` | – | hip rolls led by their measured torque, as TALOS' published controller does |
+    | `iterative` | `input`, offsets learned in ten trials before | `adaptive_posture`, in ten walks |
+    | `iterative:PATH` | offsets that `elastic iterate` has learned and saved | the same |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
-    | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
-    | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |
+    | `uncompensated_open`, `input_open` | – | without feedback of the center of mass |
+    | `residual:PATH` | a trained residual on its base: a folder, or a shipped name | the same |
 
     `iterative` has a method `rehearse(env, seed)`, which plays the trials that it learns from, each world on its own
     robot. Until then it is its base. Evaluations call it before they score.

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
+from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.policy import Zero, select_rows
 from baselines.walking.controller import WalkingGains
@@ -318,6 +319,14 @@ def test_unknown_policy_names_itself_and_the_choices() -> None:
     assert "Did you mean 'input'?" in str(caught.value)
     assert all(name in str(caught.value) for name in NAMES)
     assert set(baselines.policy_names()) >= set(NAMES)
+
+
+def test_the_table_of_make_has_every_policy_where_it_is() -> None:
+    """Catches a policy that the docs leave out, or promise on a robot that does not have it."""
+    rows = [line.strip(" |").split(" | ") for line in (baselines.make.__doc__ or "").splitlines() if "| `" in line]
+    for column, known in ((1, ON_JOINTS), (2, ON_THE_WALKER)):
+        named = {name for row in rows for name in re.findall(r"`(\w+)`", row[0]) if row[column] != "–"}
+        assert named == set(known)
 
 
 def test_unknown_option_names_itself_and_the_choices() -> None:
