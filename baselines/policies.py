@@ -27,7 +27,7 @@ ITERATIVE = "iterative:"
 
 
 def is_saved(name: str) -> bool:
-    """Whether a name is that of a policy in a folder, such as residual:PATH."""
+    """True for the name of a policy in a folder, such as residual:PATH."""
     return name.startswith((RESIDUAL, ITERATIVE))
 
 
@@ -37,12 +37,12 @@ def policy_names() -> list[str]:
 
 
 def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
-    """What is known of a policy by its name, on a walker or on another robot; None for one that is no baseline."""
+    """A baseline by its name, on a walker or on another robot; None for a policy that is no baseline."""
     return (ON_THE_WALKER if is_walker else ON_JOINTS).get(name)
 
 
 def track(name: str, is_walker: bool = True) -> Track:
-    """What a policy needs, by its name; one of a user's own is taken to read the standard sensors."""
+    """Track of a policy by its name; a user's own policy reads the standard sensors."""
     if name.startswith(RESIDUAL):
         return Track.TRAINING
     if name.startswith(ITERATIVE):
@@ -105,9 +105,9 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
         ConfigurationError: Unknown name or option, one without effect, or an environment that is not ours.
     """
     if name.startswith(RESIDUAL):
-        return _residual(Path(name.removeprefix(RESIDUAL)), env, options)
+        return _residual_policy(Path(name.removeprefix(RESIDUAL)), env, options)
     if name.startswith(ITERATIVE):
-        return _learned(Path(name.removeprefix(ITERATIVE)), env, options)
+        return _learned_policy(Path(name.removeprefix(ITERATIVE)), env, options)
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
@@ -124,7 +124,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     return known.build(env, _assumed(env, chosen), chosen)
 
 
-def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
+def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     """A trained residual around its base, whose options may be given anew."""
     description = read_description(folder)
     task = env.unwrapped.task.name
@@ -142,8 +142,8 @@ def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     return residual_policy(folder, base, env.unwrapped.assumed_model)
 
 
-def _learned(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
-    """What `iterative` has learned, around its base, whose options may be given."""
+def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
+    """Learned offsets around their base, whose options may be given."""
     description, table = load_table(folder, env)
     model: RobotModel = env.unwrapped.assumed_model
     base = make(description.base, env, **options)

@@ -141,7 +141,10 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
         residual = self._deciding.read_residual(self._last[None], action, self.action_space.shape or ())[None]
-        total, terminated, truncated, info = 0.0, False, False, {}
+        total = 0.0
+        terminated = False
+        truncated = False
+        info = {}
         for _ in range(self.settings.decision_period):
             command = self._deciding.act(self._last[None], residual)[0]
             self._last, reward, terminated, truncated, info = self.env.step(command)
@@ -194,11 +197,12 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         self._rows = np.zeros((env.num_envs, 0))
         self._last: Array | None = None
         self._done = np.zeros(env.num_envs, dtype=np.bool_)
-        self._decisions, self._cut_at = 0, np.zeros(env.num_envs, dtype=np.int64)
+        self._decisions = 0
+        self._cut_at = np.zeros(env.num_envs, dtype=np.int64)
 
     @property
     def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """What Gymnasium's wrappers ask for."""
+        """Metadata that Gymnasium's wrappers ask for."""
         return {**self.env.metadata, "autoreset_mode": self.autoreset_mode}
 
     @property
@@ -237,15 +241,15 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
         truncated |= (self._cut_at == self._decisions) & ~terminated & ~waiting
         self._done = terminated | truncated
         if waiting.any():
-            features = self._restarted(waiting, features)
+            features = self._restart(waiting, features)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             ended = self._done.copy()
             info = final_of(features, info, ended)
-            features = self._restarted(ended, features)
+            features = self._restart(ended, features)
         self._last = features.copy()
         return features, reward, terminated, truncated, info
 
-    def _restarted(self, worlds: BoolArray, features: Array) -> Array:
+    def _restart(self, worlds: BoolArray, features: Array) -> Array:
         """Features with those of new episodes in some worlds."""
         self._rows, _ = self.env.reset(options={"reset_mask": worlds})
         self._done = self._done & ~worlds
@@ -255,7 +259,9 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
         """Hold a residual for a decision period in the worlds that are alive; the observation is of features."""
         n = self.num_envs
-        reward, terminated, truncated = np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        reward = np.zeros(n)
+        terminated = np.zeros(n, dtype=np.bool_)
+        truncated = np.zeros(n, dtype=np.bool_)
         final: Array | None = None
         metrics: dict[str, Any] = {}
         reason = np.full(n, "", dtype="<U16")
@@ -269,7 +275,8 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
                 # what they see last, with the memories as they are now: the others go on
                 last = self._deciding.observe(self._rows, ended)
                 final = last if final is None else np.where(ended[:, None], last, final)
-                terminated, truncated = terminated | (ended & fell), truncated | (ended & finished)
+                terminated = terminated | (ended & fell)
+                truncated = truncated | (ended & finished)
                 reason = np.where(ended, info["termination"], reason)
                 for name, values in info["episode_metrics"].items():
                     metrics[name] = np.where(ended, values, metrics.get(name, np.zeros_like(values)))
@@ -288,7 +295,8 @@ class ResidualVectorWrapper(Stateful, gymnasium.vector.VectorWrapper[Any, Any, A
 @contextmanager
 def _no_restarts(env: Any) -> Iterator[None]:
     """Have worlds that end stay as they are for a step; whoever steps the environment itself finds it unchanged."""
-    mode, env.autoreset_mode = env.autoreset_mode, AutoresetMode.DISABLED
+    mode = env.autoreset_mode
+    env.autoreset_mode = AutoresetMode.DISABLED
     try:
         yield
     finally:

@@ -48,7 +48,8 @@ from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import RobotModel
 
-LINK_IMU, _LINK_ANGLE = "link_imu", "link_angle_imu"
+LINK_IMU = "link_imu"
+_LINK_ANGLE = "link_angle_imu"
 """Sensor, and its column."""
 _UNLOADED_RAD = 1e-3
 """Largest deflection of a joint that counts as unloaded [rad]."""
@@ -63,12 +64,12 @@ class ObserverGains(Model):
     )
     limit_nm: float = quantity("N·m", 30.0, gt=0, description="largest disturbance that is compensated")
     friction: bool = True
-    """Whether the model's Coulomb friction is known, and no disturbance. It must be as in the policy inside."""
+    """The model's Coulomb friction is known, and no disturbance. It must be as in the policy inside."""
     zero_s: float = quantity("s", 0.5, ge=0, description="time in which the IMU is zeroed at the start, 0 for never")
 
 
 class JointObservation(NamedTuple):
-    """What the observer keeps of every joint, (num_worlds, n) each.
+    """Memory of the observer for every joint, (num_worlds, n) each.
 
     Attributes:
         offset: By how much the IMU shows too little [rad].
@@ -169,7 +170,7 @@ class DisturbanceObserver(PolicyAround):
         return rows[:, self._imu] + memory.joints.offset
 
     def _observe(self, rows: Array, steps: IntArray, was: JointObservation) -> JointObservation:
-        """What is kept of the joints after a control step."""
+        """Memory of the joints after a control step."""
         gains = self._gains
         model = self._model
         theta = self.view.theta(rows)

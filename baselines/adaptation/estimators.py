@@ -25,7 +25,8 @@ from elastic_env.runtime.robot_model import WalkerModel
 _SEEN = SignalTable(BendingObserver.signals)
 _ERROR = _SEEN.group("model_error")
 _LOAD = _SEEN.names.index("excess_load")
-_ROLL, _PITCH = 0, 1
+_ROLL = 0
+_PITCH = 1
 _AXIS = np.array([_ROLL, _ROLL, _PITCH, _PITCH, _PITCH, _ROLL])  # of the joints of a leg
 _BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
 _PRIOR_LOADS = 5.0

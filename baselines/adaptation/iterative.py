@@ -81,7 +81,7 @@ class LearnedOffsets(PolicyAround):
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of a trial.
+    """Result of a trial.
 
     Attributes:
         number: Of the trial, 0 for the first, which has no offsets yet.

@@ -1,4 +1,4 @@
-r"""What is learned from trial to trial: which measured errors, and which offsets of the joints correct them.
+r"""Signals that are learned from trial to trial: which measured errors, and which offsets of the joints correct them.
 
 | robot | error, by sensors alone | correction |
 |---|---|---|
@@ -138,5 +138,5 @@ class JointSignals(LearnedSignals):
 
 
 def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
-    """What is learned of a robot."""
+    """Signals that are learned of a robot."""
     return WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)

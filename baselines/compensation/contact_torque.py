@@ -27,7 +27,8 @@ from elastic_env.runtime.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
 
-_LEGS, _PER_LEG = 2, 6
+_LEGS = 2
+_PER_LEG = 6
 
 
 CONTACT = np.dtype(
@@ -55,7 +56,8 @@ class LegTorque:
     """
 
     def __init__(self, chains: LegChains, loads: Any) -> None:
-        self._chains, self._loads = chains, loads
+        self._chains = chains
+        self._loads = loads
 
     def gravity_torque(self, q: Array) -> Array:
         """Torque that holds the legs, (num_worlds, 12) [rad] to [N·m]."""

@@ -35,7 +35,8 @@ class FixedGravity:
     """Gravity torque of a robot that stands on nothing but its base: the same at every control step."""
 
     def __init__(self, gravity: GravityModel) -> None:
-        self.gravity_torque, self.gravity_gradient = gravity.gravity_torque, gravity.gravity_gradient
+        self.gravity_torque = gravity.gravity_torque
+        self.gravity_gradient = gravity.gravity_gradient
 
     def at(self, rows: Array, level: bool = True) -> "FixedGravity":  # noqa: ARG002  a walker's
         """Itself."""
@@ -83,7 +84,7 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
 
 
 def _is_plain_hinge(model: RobotModel) -> bool:
-    """Whether the closed form of one hinge holds."""
+    """True where the closed form of one hinge holds."""
     return len(model.joint_names) == 1 and not needs_more_than_gravity(model.rigid)
 
 
@@ -123,8 +124,10 @@ class HingeTorque:
             raise ConfigurationError(
                 f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)}; choose tree"
             )
-        body, zero = RigidBody(model.rigid, names), np.zeros(1)
-        self._a, self._b = body.gravity_torque(zero), body.gravity_torque(zero + np.pi / 2)
+        body = RigidBody(model.rigid, names)
+        zero = np.zeros(1)
+        self._a = body.gravity_torque(zero)
+        self._b = body.gravity_torque(zero + np.pi / 2)
         self._inertia = body.inverse_dynamics(zero, zero, np.ones(1)) - self._a
 
     def gravity_torque(self, q: Array) -> Array:

@@ -14,12 +14,13 @@ from typing import Any
 from elastic_env.core.signals import Mirrored, Signal
 from elastic_env.runtime.robot_model import RobotModel
 
-COMMAND, DEFLECTION = "command", "deflection"
+COMMAND = "command"
+DEFLECTION = "deflection"
 
 
 @dataclass(frozen=True)
 class InputKind:
-    """What is known of an input.
+    """Unit, bounds and columns of an input.
 
     Attributes:
         unit, meaning: In words.
@@ -55,10 +56,13 @@ INPUTS: Mapping[str, InputKind] = {
         "1", "relative change of the posture feedback's gains", default=0.5, limit=1.0, axes={"all": "same"}
     ),
     "balance_gain": InputKind(
-        "1", "relative change of the gains of foot forces and center of mass", default=0.5, limit=1.0,
+        "1",
+        "relative change of the gains of foot forces and center of mass",
+        default=0.5,
+        limit=1.0,
         axes={"all": "same"},
     ),
-}  # fmt: skip
+}
 """All inputs by name. Every policy has `command`; a policy's `inputs` names the others that it has."""
 
 

@@ -21,7 +21,8 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 from elastic_env.runtime.robot_model import RobotModel
 
-TORQUE_SENSOR, LINK_ENCODER = "joint_torque", "link_encoder"
+TORQUE_SENSOR = "joint_torque"
+LINK_ENCODER = "link_encoder"
 
 
 def require_sensor(table: SignalTable, sensor: str, group: str | None = None) -> None:

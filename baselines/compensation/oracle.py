@@ -32,7 +32,7 @@ class OracleMemory(NamedTuple):
 
 
 class Oracle(PolicyAround):
-    """What perfect sensing and a perfect model give: the only policy that may read the truth.
+    """Perfect sensing and a perfect model: the only policy that may read the truth.
 
     The dynamic compensator with the true parameters around a policy that sees the true link angles; on the testbed also
     an integrator on the true link error for what is left, with a gain below the damping of the link's resonance.

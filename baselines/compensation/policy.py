@@ -77,7 +77,7 @@ class BatchPolicy(ABC):
     """
 
     reads_rates = True
-    """Whether it reads the rates of the joints; where not, a compensator around it does not estimate them."""
+    """It reads the rates of the joints; if not, a compensator around it does not estimate them."""
 
     def __init__(self, table: SignalTable, control_period_s: float) -> None:
         self.view = ObservationView(table, control_period_s)
@@ -314,14 +314,18 @@ class Motion(NamedTuple):
 
 
 class ObservationView:
-    """Where an observation table holds what compensators need, by name."""
+    """Columns of an observation that compensators need, by name."""
 
     def __init__(self, table: SignalTable, control_period_s: float) -> None:
-        self._width, self._period_s = len(table), control_period_s
+        self._width = len(table)
+        self._period_s = control_period_s
         self._clock = table.group("clock") if "clock.time" in table.names else None
-        self._theta, self._theta_dot = table.group("encoder_angle"), table.group("encoder_rate")
-        self._q, self._q_dot = table.group("reference_angle"), table.group("reference_rate")
-        self._q_ddot, self._command = table.group("reference_acceleration"), table.group("last_command")
+        self._theta = table.group("encoder_angle")
+        self._theta_dot = table.group("encoder_rate")
+        self._q = table.group("reference_angle")
+        self._q_dot = table.group("reference_rate")
+        self._q_ddot = table.group("reference_acceleration")
+        self._command = table.group("last_command")
         self.num_joints = self._theta.stop - self._theta.start
 
     def theta(self, rows: Array) -> Array:
@@ -379,7 +383,7 @@ class ObservationView:
             )
 
     def is_start(self, rows: Array) -> BoolArray:
-        """Whether an observation can be the first of an episode: by its clock, or standing with nothing commanded.
+        """True for an observation that can be the first of an episode: by its clock, or at rest without a command.
 
         Nothing is commanded where the last command is the reference, or zero, as an environment may begin with.
         """
@@ -391,9 +395,17 @@ class ObservationView:
 
 
 _GROUPS: Mapping[str, tuple[int, ...]] = {
-    "encoder_angle": (12,), "encoder_rate": (12,), "imu_attitude": (2,), "imu_rate": (3,), "wrench": (2, 2, 3),
-    "reference_angle": (12,), "reference_rate": (12,), "clock": (3,), "load_share": (), "zmp_reference": (2,),
-}  # fmt: skip
+    "encoder_angle": (12,),
+    "encoder_rate": (12,),
+    "imu_attitude": (2,),
+    "imu_rate": (3,),
+    "wrench": (2, 2, 3),
+    "reference_angle": (12,),
+    "reference_rate": (12,),
+    "clock": (3,),
+    "load_share": (),
+    "zmp_reference": (2,),
+}
 """Groups of a walker's observation, and the shapes of their fields; wrench: feet, force and moment, axes."""
 
 

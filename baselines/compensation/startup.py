@@ -47,7 +47,7 @@ class Ramp:
         return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 
     def is_over(self, steps: Array | IntArray) -> BoolArray:
-        """Whether the compensation is complete."""
+        """True where the compensation is complete."""
         return steps * self._period_s >= self._duration
 
 

@@ -27,7 +27,9 @@ from elastic_env.runtime.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
 """Share of the weight from which an estimate takes a foot for loaded, and flat on the ground."""
-MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
+MODEL_ERROR = 0.3
+OFFSET_RAD = 0.02
+DISAGREEMENT_RAD = 0.002
 """Standard deviations before the first measurement, of ρ and c, and of a measurement."""
 
 _UNKNOWNS = 2  # ρ and c
@@ -45,7 +47,7 @@ ESTIMATE = np.dtype(
         ],
     )
 )
-"""What is known of a robot's legs."""
+"""Estimates of a robot's legs."""
 
 
 class BendingObserver:
@@ -64,7 +66,7 @@ class BendingObserver:
         )
         for filtered in filters
     )
-    """What `observe` returns."""
+    """Values of `observe`."""
 
     def __init__(self, model: WalkerModel) -> None:
         self._model = model

@@ -1,4 +1,4 @@
-r"""What a walker's IMU and foot sensors would show if the ground were level.
+r"""IMU and foot sensors of a walker as they would be on level ground.
 
 Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is left of its
 direction when the acceleration of the center of mass c is taken off is the tilt of the ground λ, whatever the joints
@@ -32,7 +32,8 @@ from elastic_env.core.signals import Array, renamed
 from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
 
-TILT_RAD, VELOCITY_M_PER_S = 0.01, 0.07
+TILT_RAD = 0.01
+VELOCITY_M_PER_S = 0.07
 """σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well velocities are known."""
 
 _DIFFERENCE_S = 1e-3
@@ -67,7 +68,7 @@ class GroundLevel:
         self._wrench = table.group("wrench")
         own = renamed(table.signals_of("imu_attitude"), "own_tilt")
         self.signals = (*own, *renamed(table.signals_of("wrench"), "level_wrench"))
-        """What `observe` returns."""
+        """Values of `observe`."""
         self._theta = table.group("encoder_angle")
         self._rate = table.group("encoder_rate")
         self._carried = model.biped.chains_above_feet

@@ -25,7 +25,7 @@ from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 
 class StiffnessPrior(Model):
-    """What is known of the joints before they are measured, as standard deviations."""
+    """Knowledge of the joints before they are measured, as standard deviations."""
 
     common: float = quantity("1", 0.5, gt=0, description="relative error that all joints share")
     own: float = quantity("1", 0.1, gt=0, description="relative error of a joint beside it")

@@ -107,7 +107,7 @@ class Corrected:
         return action, CorrectedMemory(values, inner)
 
     def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
-        """What the base alone would command now, (num_worlds, n) [rad]."""
+        """Command of the base alone, (num_worlds, n) [rad]."""
         memory = resume_memory(self.base, rows, None if state is None else state.inner, episode_start)
         return self.base.act(rows, memory, NO_INPUTS)[0]
 
@@ -117,7 +117,7 @@ class Corrected:
 
 
 class Channels:
-    """What a residual acts on, by its settings: the columns of all its inputs, one input after the other.
+    """Columns on which a residual acts, by its settings: those of all its inputs, one input after the other.
 
     Args:
         model: What may be known of the robot.

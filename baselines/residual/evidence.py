@@ -23,7 +23,8 @@ from baselines.residual.correction import Corrected
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.runtime.robot_model import WalkerModel
 
-ERROR_SCALE, LOAD_SCALE = 0.1, 0.05
+ERROR_SCALE = 0.1
+LOAD_SCALE = 0.05
 """σ_ρ and σ_μ [1]: between what a right model shows in a walk, and errors that matter."""
 PRIOR_S = 0.5
 """Time for which the assumed load counts in the mean [s]: a robot that steps presses with more and with less."""
@@ -77,7 +78,7 @@ class Unreserved:
 
 
 def caution(corrected: Corrected) -> Evidence | Unreserved:
-    """What says how far a residual may act."""
+    """Judge of how far a residual may act."""
     model = corrected.model
     settings = corrected.settings
     if settings.cautious and isinstance(model, WalkerModel):  # `Corrected` refuses it for other robots

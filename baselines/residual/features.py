@@ -1,4 +1,4 @@
-"""What a residual is decided by: groups of the observation, and what can be said from it, the plan and the model.
+"""Features that decide a residual: groups of the observation, and what can be said from it, the plan and the model.
 
 | name | what it is |
 |---|---|
@@ -27,7 +27,8 @@ from elastic_env.core.signals import Array, BoolArray, Signal, renamed
 from elastic_env.dynamics.ground_contact import zero_moment_point
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
-OBSERVATION, BASE_ACTION = "observation", "base_action"
+OBSERVATION = "observation"
+BASE_ACTION = "base_action"
 
 
 class Source(Protocol):
@@ -35,7 +36,7 @@ class Source(Protocol):
 
     @property
     def signals(self) -> tuple[Signal, ...]:
-        """What its features are."""
+        """Signals of its features."""
         ...
 
     def begin(self, num_worlds: int) -> Any:
@@ -55,7 +56,7 @@ class FeaturesMemory(NamedTuple):
 
 
 class Features:
-    """What a residual is decided by, in the order of the settings; the base's action and earlier measurements last.
+    """Features that decide a residual, in the order of the settings; the base's action and earlier measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -119,7 +120,7 @@ class Features:
         return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
 
     def turn_back(self, rows: Array, residual: Array) -> Array:
-        """What a residual comes to that was decided in the mirror, (num_worlds, k); itself without one.
+        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k); itself without one.
 
         Args:
             rows: Observations of the decision.
@@ -163,7 +164,8 @@ class _Instant:
     """A source that remembers nothing."""
 
     def __init__(self, signals: tuple[Signal, ...], function: Callable[[Array], Array]) -> None:
-        self.signals, self._function = signals, function
+        self.signals = signals
+        self._function = function
 
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 0))

@@ -25,7 +25,7 @@ _SIDE = re.compile(r"(?<=\.)[lr]_")
 
 
 class Mirror:
-    """What signals of a walker are in its mirror.
+    """Image of a walker's signals in its mirror.
 
     Args:
         signals: What the columns hold, with the sides l_ and r_ behind a dot.

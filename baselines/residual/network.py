@@ -15,12 +15,13 @@ Tensors = Mapping[str, npt.NDArray[Any]]
 """`mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ..."""
 
 _ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
-_MOST_LAYERS, _LARGEST = 10, 1e6
+_MOST_LAYERS = 10
+_LARGEST = 1e6
 _TYPES = ("float32", "float64")
 
 
 class NetworkSettings(Protocol):
-    """What a network is beside its tensors."""
+    """Settings of a network beside its tensors."""
 
     @property
     def activation(self) -> Literal["tanh", "relu"]:
@@ -89,12 +90,14 @@ class Network:
 
     def __init__(self, settings: NetworkSettings, tensors: Tensors) -> None:
         depth = require_network(tensors)
-        self._mean, self._std = tensors["mean"].astype(np.float64), tensors["std"].astype(np.float64)
+        self._mean = tensors["mean"].astype(np.float64)
+        self._std = tensors["std"].astype(np.float64)
         self._layers = [
             (np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T), tensors[f"bias{i}"].astype(np.float32))
             for i in range(depth)
         ]
-        self._activation, self._output = _ACTIVATIONS[settings.activation], settings.output
+        self._activation = _ACTIVATIONS[settings.activation]
+        self._output = settings.output
         self._clip = settings.clip
 
     @property

@@ -33,7 +33,7 @@ _SHIPPED = Path(__file__).parents[1] / "trained"
 
 
 class TrainedOn(Model):
-    """What comparisons read of the configuration of a training."""
+    """Part of the configuration of a training that comparisons read."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -43,7 +43,7 @@ class TrainedOn(Model):
 
 
 class Origin(Model):
-    """What comparisons read of how a residual was trained; the rest of it is for people."""
+    """Part of the origin of a residual that comparisons read; the rest of it is for people."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -53,7 +53,7 @@ class Origin(Model):
 
 
 class ResidualDescription(Model):
-    """What `residual.json` says of the weights beside it."""
+    """Content of `residual.json`, about the weights beside it."""
 
     robot: Title
     """Task of the environment, walker or testbed."""
@@ -209,7 +209,7 @@ def located(folder: Path) -> Path:
 
 
 def read_description(folder: Path) -> ResidualDescription:
-    """What a residual says of itself; `folder` is a path or the name of a shipped one.
+    """Description of a residual; `folder` is a path or the name of a shipped one.
 
     Raises:
         ConfigurationError: There is none, or it is not valid.
@@ -225,7 +225,7 @@ def read_description(folder: Path) -> ResidualDescription:
 
 
 def _none_at(folder: Path, why: str) -> str:
-    """What to do where no residual is, in a sentence."""
+    """Sentence that says what to do where no residual is."""
     try:
         inside = [path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")]
     except OSError:  # a name that is too long, or a folder that cannot be read

@@ -111,7 +111,7 @@ CONTROLLER = np.dtype(
         ],
     )
 )
-"""What the controller assumes, and its gains."""
+"""Assumptions of the controller, and its gains."""
 
 PLAN = np.dtype((np.record, [("share", np.float64), ("com", np.float64, (2,)), ("com_dot", np.float64, (2,))]))
 """Load share of the right foot, and center of mass of the plan, one row per control step."""
@@ -146,7 +146,7 @@ INPUTS = np.dtype(
         ],
     )
 )
-"""What something outside adds; zeros are as if there were none, to the last bit."""
+"""Inputs from outside; zeros are as if there were none, to the last bit."""
 
 
 class WalkingController(BatchPolicy):
@@ -256,7 +256,7 @@ _NO_SHARES: Array = np.empty(0)
 
 
 def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> Any:
-    """What the kernel needs to know, a row of `CONTROLLER`, (1,)."""
+    """Row of `CONTROLLER` for the kernel, (1,)."""
     biped = model.biped
     stiffness = model.stiffness.reshape(2, 6)
     period_s = model.control_period_s

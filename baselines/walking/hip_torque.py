@@ -37,7 +37,7 @@ class HipTorqueGains(Model):
     limit_rad: float = quantity("rad", 0.01, gt=0, description="largest offset")
     rate_rad_s: float = quantity("rad/s", 0.003, gt=0, description="largest rate of the offset")
     in_double_support: bool = False
-    """Whether it also acts in double support, as where the published entity has no phase connected."""
+    """It also acts in double support, as where the published entity has no phase connected."""
 
 
 def low_pass(before: Array, value: Array, cutoff_hz: float, period_s: float) -> Array:

@@ -28,7 +28,9 @@ from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import WalkerModel
 
-_HIP_ROLL, _HIP_PITCH = 1, 2  # of six joints of a leg
+# of six joints of a leg
+_HIP_ROLL = 1
+_HIP_PITCH = 2
 
 
 class PostureGains(Model):

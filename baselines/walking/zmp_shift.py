@@ -99,7 +99,7 @@ STANCE = np.dtype(
         ],
     )
 )
-"""Where the plan has pelvis and ankles, and its joint angles, one row per control step."""
+"""Pelvis, ankles and joint angles of the plan, one row per control step."""
 
 
 class Stances(NamedTuple):
