@@ -11,10 +11,9 @@ from functools import partial
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
-from baselines.adaptation.estimators import EncoderEstimator, LegEstimator
+from baselines.adaptation.estimators import EncoderEstimator, LegEstimator, LinkEncoderEstimator
 from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
-from baselines.adaptation.link_sensors import LinkEncoderEstimator
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import Compensator, DynamicCompensator, GravityCompensator, OutputMethod
@@ -126,16 +125,10 @@ def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _with_posture(build: Builder) -> Builder:
-    return lambda env, model, options: PostureFeedback(
-        build(env, model, options), model, options.posture, options.ramp_s
-    )
-
-
-def _with_offset(build: Builder) -> Builder:
-    """With the planned ZMP shifted against its mean error, where that is asked for."""
+    """With posture feedback, and with the planned ZMP shifted against its mean error where that is asked for."""
 
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        policy = build(env, model, options)
+        policy = PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
         return policy if options.zmp_offset is None else ZmpOffset(policy, model, options.zmp_offset)
 
     return built
@@ -233,9 +226,9 @@ ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "input_open": NamedPolicy(_without_feedback(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
     "adaptive": NamedPolicy(_weighing(_adaptive), (*_COMPENSATED, "base", "adaptation")),
-    "posture": NamedPolicy(_with_offset(_with_posture(_base)), (*_COMPENSATED, "base", *_POSTURE)),
+    "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
     "adaptive_posture": NamedPolicy(
-        _with_offset(_weighing(_with_posture(_adaptive))), (*_COMPENSATED, "base", "adaptation", *_POSTURE)
+        _weighing(_with_posture(_adaptive)), (*_COMPENSATED, "base", "adaptation", *_POSTURE)
     ),
     "torque_sensor": NamedPolicy(
         _weighing(_with_sensors(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)

@@ -5,9 +5,12 @@ r"""By how much the joints bend more than the model says, r, from what a robot m
 | `LegEstimator` | encoders, foot sensors, IMU | (1 + ρ_roll) (1 + μ) for all joints of a leg but yaw |
 | the same | also joint torques | (1 + ρ_roll) (1 + μ) for rolls, (1 + ρ_pitch) (1 + μ) for pitches |
 | `EncoderEstimator` | also link encoders | (1 + r_j) (1 + μ) joint by joint |
+| `LinkEncoderEstimator` | encoders on motors and links of a robot on a fixed base | 1 + r_j joint by joint |
 
 ρ is the relative error of a leg's compliance by `BendingObserver`, μ the mean excess load of the feet. Without torque
-sensors ρ of pitch is left out: friction hides the bending there. Joints without a link encoder have r_j = 0.
+sensors ρ of pitch is left out: friction hides the bending there. Joints without a link encoder have r_j = 0. r_j is by
+the regression of `baselines.estimation.joint_stiffness`. The expected deflection is :math:`h = K^{-1} (\tau + \tau_F)`
+with the Coulomb friction, and with the torque of the measured foot wrenches, or of the motion on a fixed base.
 """
 
 from abc import abstractmethod
@@ -16,11 +19,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from typing_extensions import override
 
+from baselines.compensation.compensators import GravityCompensator
+from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import DeflectionSensors
+from baselines.compensation.policy import ObservationView
 from baselines.estimation.bending import BendingObserver
-from baselines.estimation.joint_stiffness import JointStiffnessObserver
+from baselines.estimation.joint_stiffness import RegressionMemory, StiffnessPrior, StiffnessRegression
 from elastic_env.core.signals import Array, SignalTable
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
 _SEEN = SignalTable(BendingObserver.signals)
 _ERROR = _SEEN.group("model_error")
@@ -31,6 +37,8 @@ _AXIS = np.array([_ROLL, _ROLL, _PITCH, _PITCH, _PITCH, _ROLL])  # of the joints
 _BENDS = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # the yaw hardly does
 _PRIOR_LOADS = 5.0
 """Number of measurements that the assumed load counts for."""
+ARM_PRIOR = StiffnessPrior(own=0.3, noise_rad=0.005)
+"""Joints of an arm are less alike than those of two legs, and no foot sensors add errors of their own."""
 
 
 class Estimator(Protocol):
@@ -89,21 +97,61 @@ class EncoderEstimator(Estimator):
 
     def __init__(self, model: WalkerModel, sensors: DeflectionSensors) -> None:
         self._sensors = sensors
-        self._observer = JointStiffnessObserver(model)
+        self._regression = StiffnessRegression(model, StiffnessPrior())
+        self._compensator = GravityCompensator(model, output="wrench")
+        self._theta = model.observation_table.group("encoder_angle")
+        self._stiffness = model.stiffness
         self._wrench = model.observation_table.group("wrench")
         self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
 
     @override
     def begin(self, num_worlds: int) -> EstimatorMemory:
-        return EstimatorMemory(np.zeros((num_worlds, 2)), self._observer.begin(num_worlds))
+        return EstimatorMemory(np.zeros((num_worlds, 2)), self._regression.begin(num_worlds))
 
     @override
     def estimate(self, rows: Array, memory: EstimatorMemory) -> tuple[Array, EstimatorMemory]:
         has = self._sensors.has
-        error, observer = self._observer.observe(rows, self._sensors.deflection(rows), has, memory.observer)
+        deflection = self._sensors.deflection(rows)
+        theta = rows[:, self._theta]
+        q = theta - deflection
+        friction = self._regression.friction(q, memory.observer)
+        h = theta - self._compensator.at(rows).link_angle(theta) + friction / self._stiffness
+        error, observer = self._regression.add(h, deflection, friction, q, memory.observer, measured=has)
         force = rows[:, self._wrench].reshape(len(rows), 2, 2, 3)[:, :, 0, 2]
         load, loads = mean_load(memory.loads, force.sum(axis=1, keepdims=True) / self._carried - 1.0)
         return (1.0 + has * error) * (1.0 + load) - 1.0, EstimatorMemory(loads, observer)
+
+
+class LinkEncoderEstimator(Estimator):
+    """r of each joint by encoders on all links, see the module.
+
+    Args:
+        model: Assumed robot on a fixed base.
+        sensors: Its link encoders.
+        prior: What is known of r before it is measured.
+    """
+
+    def __init__(self, model: RobotModel, sensors: DeflectionSensors, prior: StiffnessPrior = ARM_PRIOR) -> None:
+        self._sensors = sensors
+        self._regression = StiffnessRegression(model, prior)
+        self._view = ObservationView(model.observation_table, model.control_period_s)
+        self._body = make_dynamics(model, GravityCompensator(model).gravity)
+        self._stiffness = model.stiffness
+        self._viscous = model.viscous_friction
+
+    @override
+    def begin(self, num_worlds: int) -> RegressionMemory:
+        return self._regression.begin(num_worlds)
+
+    @override
+    def estimate(self, rows: Array, memory: RegressionMemory) -> tuple[Array, RegressionMemory]:
+        deflection = self._sensors.deflection(rows)
+        motion = self._view.motion(rows)
+        q = self._view.theta(rows) - deflection
+        friction = self._regression.friction(q, memory)
+        torque = self._body.inverse_dynamics(q, motion.q_dot, motion.q_ddot) + self._viscous * motion.q_dot
+        h = (torque + friction) / self._stiffness
+        return self._regression.add(h, deflection, friction, q, memory, measured=self._sensors.has)
 
 
 def mean_load(memory: Array, excess: Array, prior: float = _PRIOR_LOADS) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from baselines.compensation.gravity_torque import (
     make_load,
 )
 from baselines.compensation.policy import Motion
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
@@ -289,17 +289,12 @@ class DynamicCompensator(Compensator):
         return self._static.link_rate(theta, theta_dot)
 
 
-DRIVE = np.dtype(
-    (
-        np.record,
-        [
-            ("damping", np.float64),  # D [N·m·s/rad]
-            ("rotor_inertia", np.float64),  # B [kg·m²]
-            ("position_gain", np.float64),  # [N·m/rad]
-            ("velocity_gain", np.float64),  # [N·m·s/rad]
-            ("integral_gain", np.float64),  # [N·m/(rad·s)]
-        ],
-    )
+DRIVE = record_type(
+    damping=(),  # D [N·m·s/rad]
+    rotor_inertia=(),  # B [kg·m²]
+    position_gain=(),  # [N·m/rad]
+    velocity_gain=(),  # [N·m·s/rad]
+    integral_gain=(),  # [N·m/(rad·s)]
 )
 """Rotor, damper and servo of a joint."""
 

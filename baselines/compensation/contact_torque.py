@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from baselines.compensation.policy import WalkView
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.leg_chains import LegChains
 from elastic_env.dynamics.leg_kernels import gradients, loads_type, solutions, torques
@@ -31,18 +31,13 @@ _LEGS = 2
 _PER_LEG = 6
 
 
-CONTACT = np.dtype(
-    (
-        np.record,
-        [
-            ("gravity", np.float64),  # [m/s²]
-            ("mass", np.float64),  # of the robot [kg]
-            ("footholds", np.float64, (2, 2)),  # middles of the soles [m]
-            ("ankle_height", np.float64),  # [m]
-            ("is_at_zmp", np.bool_),  # or at the ankle axes
-            ("legs_weigh", np.bool_),
-        ],
-    )
+CONTACT = record_type(
+    gravity=(),  # [m/s²]
+    mass=(),  # of the robot [kg]
+    footholds=(2, 2),  # middles of the soles [m]
+    ankle_height=(),  # [m]
+    is_at_zmp=bool,  # or at the ankle axes
+    legs_weigh=bool,
 )
 """How the ground carries the robot."""
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.policy import Records, WalkView
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array, Signal
 from elastic_env.dynamics.leg_kernels import sole_tilts
 from elastic_env.runtime.robot_model import WalkerModel
@@ -38,14 +38,9 @@ _FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"
 _PRIOR: Array = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
 """Upper triangle of the covariance before the first measurement."""
 
-ESTIMATE = np.dtype(
-    (
-        np.record,
-        [
-            ("unknowns", np.float64, (2, 2, 2)),  # legs, roll and pitch: ρ [1] and c [rad]
-            ("covariance", np.float64, (2, 2, 3)),  # its upper triangle
-        ],
-    )
+ESTIMATE = record_type(
+    unknowns=(2, 2, 2),  # legs, roll and pitch: ρ [1] and c [rad]
+    covariance=(2, 2, 3),  # its upper triangle
 )
 """Estimates of a robot's legs."""
 

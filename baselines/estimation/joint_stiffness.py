@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.compensation.compensators import GravityCompensator, presliding_friction
+from baselines.compensation.compensators import presliding_friction
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.runtime.robot_model import RobotModel
 
 
 class StiffnessPrior(Model):
@@ -109,39 +109,3 @@ class StiffnessRegression:
         y = deflection - h
         sums = memory.sums + measured * np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
         return regress(sums.swapaxes(0, 1), self._prior), RegressionMemory(friction, q, sums)
-
-
-class JointStiffnessObserver:
-    """Relative errors of the joints' deflections from measured ones, see the module.
-
-    Args:
-        model: Assumed walker.
-        prior: What is known before.
-    """
-
-    def __init__(self, model: WalkerModel, prior: StiffnessPrior | None = None) -> None:
-        self._regression = StiffnessRegression(model, prior or StiffnessPrior())
-        self._compensator = GravityCompensator(model, output="wrench")
-        self._theta = model.observation_table.group("encoder_angle")
-        self._stiffness = model.stiffness
-
-    def begin(self, num_worlds: int) -> RegressionMemory:
-        """Memory before the first measurement."""
-        return self._regression.begin(num_worlds)
-
-    def observe(
-        self, rows: Array, deflection: Array, measured: BoolArray, memory: RegressionMemory
-    ) -> tuple[Array, RegressionMemory]:
-        """Relative errors r after a measurement, (num_worlds, n) [1], and the new memory.
-
-        Args:
-            rows: Observations, (num_worlds, m).
-            deflection: Measured δ = θ − q, (num_worlds, n) [rad].
-            measured: Which joints have a sensor, (n,).
-            memory: That of the last measurement.
-        """
-        theta = rows[:, self._theta]
-        q = theta - deflection
-        friction = self._regression.friction(q, memory)
-        h = theta - self._compensator.at(rows).link_angle(theta) + friction / self._stiffness
-        return self._regression.add(h, deflection, friction, q, memory, measured)

@@ -65,25 +65,13 @@ class Evidence:
         return g[:, None], EvidenceMemory(loads, bending)
 
 
-class Unreserved:
-    """Caution that lets everything pass; see `Evidence`."""
-
-    def begin(self, num_worlds: int) -> Array:
-        """No memory, (num_worlds, 0)."""
-        return np.zeros((num_worlds, 0))
-
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Ones, (num_worlds, 1)."""
-        return np.ones((len(rows), 1)), memory
-
-
-def caution(corrected: Corrected) -> Evidence | Unreserved:
-    """Judge of how far a residual may act."""
+def caution(corrected: Corrected) -> Evidence | None:
+    """Judge of how far a residual may act; None for one that is not cautious."""
     model = corrected.model
     settings = corrected.settings
     if settings.cautious and isinstance(model, WalkerModel):  # `Corrected` refuses it for other robots
         return Evidence(model, settings.decision_period * model.control_period_s)
-    return Unreserved()
+    return None
 
 
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:

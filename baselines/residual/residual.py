@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import BatchPolicy, Policy, PolicyInputs, put_rows, select_rows
 from baselines.residual.correction import Corrected, CorrectedMemory
-from baselines.residual.evidence import caution
+from baselines.residual.evidence import EvidenceMemory, caution
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network, Tensors
 from baselines.residual.settings import ResidualSettings
@@ -108,14 +108,14 @@ class ResidualMemory(NamedTuple):
         wait: Control steps until the next decision, (num_worlds,); -1 before the first.
         residual: What was decided, (num_worlds, k).
         features: Memory of the features.
-        caution: Memory of caution.
+        caution: Memory of the evidence, None without caution.
         inner: Memory of the corrected base.
     """
 
     wait: IntArray
     residual: Array
     features: FeaturesMemory
-    caution: Any
+    caution: EvidenceMemory | None
     inner: CorrectedMemory
 
 
@@ -151,7 +151,7 @@ class ResidualPolicy(BatchPolicy):
             wait=np.full(len(rows), _UNDECIDED),
             residual=np.zeros((len(rows), self.corrected.num_residuals)),
             features=self._features.begin(len(rows)),
-            caution=self._caution.begin(len(rows)),
+            caution=self._caution.begin(len(rows)) if self._caution is not None else None,
             inner=self.corrected.begin(rows),
         )
 
@@ -170,9 +170,12 @@ class ResidualPolicy(BatchPolicy):
     def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> ResidualMemory:
         """Memory after a decision, of the worlds that are due."""
         seen, features = self._features.at(rows, memory.features, memory.wait == _UNDECIDED, memory.inner, None)
-        trust, known = self._caution.observe(rows, memory.caution)
+        known = None
         residual = memory.residual.copy()
-        residual[due] = self._features.turn_back(rows[due], self._network(seen[due])) * trust[due]
+        residual[due] = self._features.turn_back(rows[due], self._network(seen[due]))
+        if self._caution is not None:
+            trust, known = self._caution.observe(rows, memory.caution)
+            residual[due] *= trust[due]
         wait = np.full_like(memory.wait, self._period)
         return ResidualMemory(wait, residual, features, known, memory.inner)
 

@@ -30,7 +30,7 @@ from typing_extensions import override
 from baselines.compensation.contact_torque import shifted_shares
 from baselines.compensation.policy import NO_INPUTS, ONE_WORLD, BatchPolicy, PolicyInputs, Records, WalkView
 from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share, move_pelvis
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.biped import Biped
@@ -83,68 +83,53 @@ def _sole(biped: Biped) -> Array:
     return np.array([0.0, 0.0, -biped.ankle_height])
 
 
-CONTROLLER = np.dtype(
-    (
-        np.record,
-        [
-            ("period_s", np.float64),
-            ("is_com_fed_back", np.bool_),
-            ("thigh", np.float64),  # [m]
-            ("shank", np.float64),  # [m]
-            ("footholds", np.float64, (2, 2)),  # [m]
-            ("weight", np.float64),  # of the robot [N]
-            ("weight_of_feet", np.float64),  # below the sensors [N]
-            ("omega", np.float64),  # of the pendulum [rad/s]
-            ("following_share", np.float64),  # of its way in a period [1]
-            ("per_pelvis", np.float64, (2,)),  # motion of the center of mass per motion of the pelvis [1]
-            ("ankle_stiffness", np.float64, (2, 2)),  # pitch and roll of the legs [N·m/rad]
-            ("friction_deflection", np.float64, (2, 6)),  # [rad]
-            ("friction_rate_rad_s", np.float64),
-            ("force_difference", np.float64),
-            ("force_difference_decay_s", np.float64),
-            ("force_difference_limit_m", np.float64),
-            ("dcm", np.float64),
-            ("zmp_limit_m", np.float64),
-            ("velocity_share", np.float64),  # of a step in a period [1]
-            ("zmp_share", np.float64),  # likewise
-            ("weight_share", np.float64),  # likewise
-        ],
-    )
+CONTROLLER = record_type(
+    period_s=(),
+    is_com_fed_back=bool,
+    thigh=(),  # [m]
+    shank=(),  # [m]
+    footholds=(2, 2),  # [m]
+    weight=(),  # of the robot [N]
+    weight_of_feet=(),  # below the sensors [N]
+    omega=(),  # of the pendulum [rad/s]
+    following_share=(),  # of its way in a period [1]
+    per_pelvis=(2,),  # motion of the center of mass per motion of the pelvis [1]
+    ankle_stiffness=(2, 2),  # pitch and roll of the legs [N·m/rad]
+    friction_deflection=(2, 6),  # [rad]
+    friction_rate_rad_s=(),
+    force_difference=(),
+    force_difference_decay_s=(),
+    force_difference_limit_m=(),
+    dcm=(),
+    zmp_limit_m=(),
+    velocity_share=(),  # of a step in a period [1]
+    zmp_share=(),  # likewise
+    weight_share=(),  # likewise
 )
 """Assumptions of the controller, and its gains."""
 
-PLAN = np.dtype((np.record, [("share", np.float64), ("com", np.float64, (2,)), ("com_dot", np.float64, (2,))]))
+PLAN = record_type(share=(), com=(2,), com_dot=(2,))
 """Load share of the right foot, and center of mass of the plan, one row per control step."""
 
-MEMORY = np.dtype(
-    (
-        np.record,
-        [
-            ("steps", np.float64),
-            ("difference", np.float64),  # of the leg lengths [m]
-            ("com", np.float64, (2, 2)),  # from both soles [m]
-            ("velocity", np.float64, (2,)),  # its deviation from the plan [m/s]
-            ("shift", np.float64, (2,)),  # of the ZMP [m]
-            ("following", np.float64, (2,)),  # shift of the planned center of mass for the input `zmp` [m]
-            ("planned", np.float64, (2,)),  # that shift in all [m]
-            ("weight", np.float64),  # as measured [N]
-        ],
-    )
+MEMORY = record_type(
+    steps=(),
+    difference=(),  # of the leg lengths [m]
+    com=(2, 2),  # from both soles [m]
+    velocity=(2,),  # its deviation from the plan [m/s]
+    shift=(2,),  # of the ZMP [m]
+    following=(2,),  # shift of the planned center of mass for the input `zmp` [m]
+    planned=(2,),  # that shift in all [m]
+    weight=(),  # as measured [N]
 )
 """Memory of the controller."""
 
-INPUTS = np.dtype(
-    (
-        np.record,
-        [
-            ("zmp", np.float64, (2,)),  # [m]
-            ("com", np.float64, (2,)),  # [m]
-            ("leg_length", np.float64),  # [m]
-            ("hip", np.float64, (2, 2)),  # roll and pitch of either leg [rad]
-            ("balance_gain", np.float64),  # relative change [1]
-            ("deflection", np.float64, (2, 6)),  # relative change [1]
-        ],
-    )
+INPUTS = record_type(
+    zmp=(2,),  # [m]
+    com=(2,),  # [m]
+    leg_length=(),  # [m]
+    hip=(2, 2),  # roll and pitch of either leg [rad]
+    balance_gain=(),  # relative change [1]
+    deflection=(2, 6),  # relative change [1]
 )
 """Inputs from outside; zeros are as if there were none, to the last bit."""
 

@@ -22,7 +22,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, WalkView
 from baselines.compensation.startup import Ramp
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
@@ -47,34 +47,24 @@ class PostureGains(Model):
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
 
-POSTURE = np.dtype(
-    (
-        np.record,
-        [
-            ("period_s", np.float64),
-            ("proportional", np.float64),  # [1]
-            ("integral", np.float64),  # [1/s]
-            ("derivative", np.float64),  # [s]
-            ("leak_s", np.float64),
-            ("limit_rad", np.float64),
-            ("integral_limit", np.float64),  # [rad·s]
-            ("filter_share", np.float64),  # of a step in a period [1]
-            ("swing_share", np.float64),  # likewise
-        ],
-    )
+POSTURE = record_type(
+    period_s=(),
+    proportional=(),  # [1]
+    integral=(),  # [1/s]
+    derivative=(),  # [s]
+    leak_s=(),
+    limit_rad=(),
+    integral_limit=(),  # [rad·s]
+    filter_share=(),  # of a step in a period [1]
+    swing_share=(),  # likewise
 )
 """Gains of the posture feedback."""
 
-FEEDBACK = np.dtype(
-    (
-        np.record,
-        [
-            ("steps", np.float64),
-            ("tilt", np.float64, (2,)),  # filtered roll and pitch [rad]
-            ("integral", np.float64, (2,)),  # of them [rad·s]
-            ("kept", np.float64, (2,)),  # hip pitch that either leg keeps [rad]
-        ],
-    )
+FEEDBACK = record_type(
+    steps=(),
+    tilt=(2,),  # filtered roll and pitch [rad]
+    integral=(2,),  # of them [rad·s]
+    kept=(2,),  # hip pitch that either leg keeps [rad]
 )
 """Memory of the posture feedback."""
 

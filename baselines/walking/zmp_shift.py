@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import linalg
 
-from elastic_env.core.compiled import compiled
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.leg_kinematics import LegGeometry
 from elastic_env.runtime.robot_model import WalkerModel
@@ -76,28 +76,18 @@ def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
     return np.diagonal((com[:2] - com[2:])[:, :2] / (2.0 * _PROBE_M)).copy()
 
 
-LEGS = np.dtype(
-    (
-        np.record,
-        [
-            ("thigh", np.float64),  # [m]
-            ("shank", np.float64),  # [m]
-            ("reach", np.float64),  # to which ankles come from their hips [m]
-            ("hips", np.float64, (2, 3)),  # [m]
-        ],
-    )
+LEGS = record_type(
+    thigh=(),  # [m]
+    shank=(),  # [m]
+    reach=(),  # to which ankles come from their hips [m]
+    hips=(2, 3),  # [m]
 )
 """The legs, to move the pelvis over feet that stay."""
 
-STANCE = np.dtype(
-    (
-        np.record,
-        [
-            ("pelvis", np.float64, (3,)),  # [m]
-            ("ankles", np.float64, (2, 3)),  # [m]
-            ("q", np.float64, (2, 6)),  # [rad]
-        ],
-    )
+STANCE = record_type(
+    pelvis=(3,),  # [m]
+    ankles=(2, 3),  # [m]
+    q=(2, 6),  # [rad]
 )
 """Pelvis, ankles and joint angles of the plan, one row per control step."""
 
