@@ -11,10 +11,9 @@ from functools import partial
 from typing import Any
 
 from baselines.adaptation.disturbance_observer import LINK_IMU, DisturbanceObserver
-from baselines.adaptation.estimators import EncoderEstimator, LegEstimator
+from baselines.adaptation.estimators import EncoderEstimator, LegEstimator, LinkEncoderEstimator
 from baselines.adaptation.iterative import IterativeLearner
 from baselines.adaptation.learned_signals import learned_signals
-from baselines.adaptation.link_sensors import LinkEncoderEstimator
 from baselines.adaptation.online_stiffness import OnlineStiffness
 from baselines.compensation.compensated import Compensated
 from baselines.compensation.compensators import Compensator, DynamicCompensator, GravityCompensator, OutputMethod
@@ -36,7 +35,7 @@ Builder = Callable[[Any, Any, PolicyOptions], Any]
 
 
 class Track(StrEnum):
-    """What a policy needs: a track of the leaderboard."""
+    """Needs of a policy: a track of the leaderboard."""
 
     STANDARD = "encoders, foot sensors and IMU"
     TORQUE_SENSORS = "joint torque sensors"
@@ -87,7 +86,7 @@ def _controller(env: Any, model: WalkerModel, options: PolicyOptions) -> Policy:
     return WalkingController(model, options.com_feedback, options.gains or WalkingGains(), options.ramp_s)
 
 
-def _open(build: Builder) -> Builder:
+def _without_feedback(build: Builder) -> Builder:
     return lambda env, model, options: build(env, model, options.replace(com_feedback=False))
 
 
@@ -126,16 +125,10 @@ def _adaptive(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
 
 
 def _with_posture(build: Builder) -> Builder:
-    return lambda env, model, options: PostureFeedback(
-        build(env, model, options), model, options.posture, options.ramp_s
-    )
-
-
-def _with_offset(build: Builder) -> Builder:
-    """With the planned ZMP shifted against its mean error, where that is asked for."""
+    """With posture feedback, and with the planned ZMP shifted against its mean error where that is asked for."""
 
     def built(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
-        policy = build(env, model, options)
+        policy = PostureFeedback(build(env, model, options), model, options.posture, options.ramp_s)
         return policy if options.zmp_offset is None else ZmpOffset(policy, model, options.zmp_offset)
 
     return built
@@ -161,7 +154,7 @@ def _iterative(env: Any, model: RobotModel, options: PolicyOptions) -> Any:
     return IterativeLearner(base, model, signals, options.learning.trials, options.ramp_s)
 
 
-def _measured(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
+def _with_sensors(sensor: str, joints: tuple[str, ...] = ("",)) -> Builder:
     """Deflections of some joints by sensors, around `dynamic`, with the stiffness adapted by them."""
 
     def build(env: Any, model: WalkerModel, options: PolicyOptions) -> Any:
@@ -228,22 +221,24 @@ ON_JOINTS: Mapping[str, NamedPolicy] = {
 
 ON_THE_WALKER: Mapping[str, NamedPolicy] = {
     "zero": NamedPolicy(_zero),
-    "uncompensated_open": NamedPolicy(_open(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),
+    "uncompensated_open": NamedPolicy(_without_feedback(_controller), (*ASSUMED_OPTIONS, "gains", "ramp_s")),
     "uncompensated": NamedPolicy(_controller, (*ASSUMED_OPTIONS, *_CONTROLLER, "ramp_s")),
-    "input_open": NamedPolicy(_open(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
+    "input_open": NamedPolicy(_without_feedback(COMPENSATED["input"]), (*_COMPENSATOR, "gains")),
     **{name: NamedPolicy(build, _COMPENSATED) for name, build in COMPENSATED.items()},
     "adaptive": NamedPolicy(_weighing(_adaptive), (*_COMPENSATED, "base", "adaptation")),
-    "posture": NamedPolicy(_with_offset(_with_posture(_base)), (*_COMPENSATED, "base", *_POSTURE)),
+    "posture": NamedPolicy(_with_posture(_base), (*_COMPENSATED, "base", *_POSTURE)),
     "adaptive_posture": NamedPolicy(
-        _with_offset(_weighing(_with_posture(_adaptive))), (*_COMPENSATED, "base", "adaptation", *_POSTURE)
+        _weighing(_with_posture(_adaptive)), (*_COMPENSATED, "base", "adaptation", *_POSTURE)
     ),
     "torque_sensor": NamedPolicy(
-        _weighing(_measured(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
+        _weighing(_with_sensors(TORQUE_SENSOR)), _MEASURED, Track.TORQUE_SENSORS, (TORQUE_SENSOR,)
     ),
     "hip_sensor": NamedPolicy(
-        _weighing(_measured(LINK_ENCODER, ("hip",))), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
+        _weighing(_with_sensors(LINK_ENCODER, ("hip",))), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
     ),
-    "link_encoder": NamedPolicy(_weighing(_measured(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)),
+    "link_encoder": NamedPolicy(
+        _weighing(_with_sensors(LINK_ENCODER)), _MEASURED, Track.LINK_ENCODERS, (LINK_ENCODER,)
+    ),
     "thormang": NamedPolicy(_thormang, ("stance_roll", "foot_balance", "ramp_s")),
     "talos": NamedPolicy(
         _talos, (*ASSUMED_OPTIONS, *_CONTROLLER, "hip_torque", "ramp_s"), Track.TORQUE_SENSORS, (TORQUE_SENSOR,)

@@ -27,7 +27,7 @@ ITERATIVE = "iterative:"
 
 
 def is_saved(name: str) -> bool:
-    """Whether a name is that of a policy in a folder, such as residual:PATH."""
+    """True for the name of a policy in a folder, such as residual:PATH."""
     return name.startswith((RESIDUAL, ITERATIVE))
 
 
@@ -37,12 +37,12 @@ def policy_names() -> list[str]:
 
 
 def named_policy(name: str, is_walker: bool) -> NamedPolicy | None:
-    """What is known of a policy by its name, on a walker or on another robot; None for one that is no baseline."""
+    """A baseline by its name, on a walker or on another robot; None for a policy that is no baseline."""
     return (ON_THE_WALKER if is_walker else ON_JOINTS).get(name)
 
 
 def track(name: str, is_walker: bool = True) -> Track:
-    """What a policy needs, by its name; one of a user's own is taken to read the standard sensors."""
+    """Track of a policy by its name; a user's own policy reads the standard sensors."""
     if name.startswith(RESIDUAL):
         return Track.TRAINING
     if name.startswith(ITERATIVE):
@@ -68,26 +68,26 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     | name | on the testbed | on the walker |
     |---|---|---|
     | `zero` | plays the reference back | the same |
-    | `uncompensated` | the same | walking controller alone, which takes motors for links |
+    | `uncompensated` | the same | walking controller alone; it takes motors for links |
     | `input` | Eq. 9 on the command, Eq. 12 (or Newton) on the encoder | Eq. 9 around the controller |
-    | `input_output` | - | also Eq. 12: the controller sees the estimated links |
-    | `input_wrench` | - | the estimate takes the measured foot wrenches instead of the planned load share |
-    | `dynamic` | deflection from the full joint torque, D, B and servo inverted | the same, estimate as before |
-    | `friction` | `dynamic`, and the model's Coulomb friction fed forward | - |
-    | `disturbance_observer` | `friction`, and the torque that the link's IMU shows to be missing | - |
-    | `adaptive` | - | `input_output` with the stiffness of each leg adapted online |
-    | `posture` | - | `input_output` with the pelvis' attitude fed back to the hips |
-    | `adaptive_posture` | - | both: the strongest with the standard sensors |
-    | `torque_sensor` | - | deflections by joint torque sensors, K⁻¹ τ_J |
-    | `link_encoder` | `dynamic`, the K of each joint adapted by link encoders | deflections by link encoders |
-    | `hip_sensor` | - | the same at the hips alone |
-    | `thormang` | - | what this robot's published controller does: hip roll in single support, feet by IMU and wrench |
-    | `talos` | - | the controller, its hip rolls led by their measured torque, as TALOS' published one does |
-    | `iterative` | `input`, offsets learned on this robot before | `adaptive_posture`, likewise: see below |
-    | `iterative:PATH` | what it has learned once, from its folder | the same |
+    | `input_output` | – | and Eq. 12: the controller sees the estimated links |
+    | `input_wrench` | – | the estimate takes the measured foot wrenches, not the planned share |
+    | `dynamic` | full joint torque with D; servo with B inverted | the same, links as `input_wrench` |
+    | `friction` | `dynamic`, and the model's Coulomb friction fed forward | – |
+    | `disturbance_observer` | `friction`, and the torque that the link's IMU finds missing | – |
+    | `adaptive` | – | `input_output`, stiffness of each leg and weight estimated online |
+    | `posture` | – | `input_output` with the pelvis' attitude fed back to the hips |
+    | `adaptive_posture` | – | both: the strongest with the standard sensors |
+    | `torque_sensor` | – | deflections by joint torque sensors, K⁻¹ τ_J |
+    | `link_encoder` | `dynamic`, K of each joint by link encoders | deflections by link encoders |
+    | `hip_sensor` | – | the same at the hips alone |
+    | `thormang` | – | this robot's published controller: hip roll, feet by IMU and wrench |
+    | `talos` | – | hip rolls led by their measured torque, as TALOS' published controller does |
+    | `iterative` | `input`, offsets learned in ten trials before | `adaptive_posture`, in ten walks |
+    | `iterative:PATH` | offsets that `elastic iterate` has learned and saved | the same |
     | `oracle` | true parameters, integral action on the true link error | true parameters, true links |
-    | `uncompensated_open`, `input_open` | - | without feedback of the center of mass |
-    | `residual:PATH` | a trained residual from its folder, or by the name of a shipped one | the same |
+    | `uncompensated_open`, `input_open` | – | without feedback of the center of mass |
+    | `residual:PATH` | a trained residual on its base: a folder, or a shipped name | the same |
 
     `iterative` has a method `rehearse(env, seed)`, which plays the trials that it learns from, each world on its own
     robot. Until then it is its base. Evaluations call it before they score.
@@ -105,9 +105,9 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
         ConfigurationError: Unknown name or option, one without effect, or an environment that is not ours.
     """
     if name.startswith(RESIDUAL):
-        return _residual(Path(name.removeprefix(RESIDUAL)), env, options)
+        return _residual_policy(Path(name.removeprefix(RESIDUAL)), env, options)
     if name.startswith(ITERATIVE):
-        return _learned(Path(name.removeprefix(ITERATIVE)), env, options)
+        return _learned_policy(Path(name.removeprefix(ITERATIVE)), env, options)
     if not hasattr(env.unwrapped, "assumed_model"):
         raise ConfigurationError(
             f"a baseline needs an environment with an assumed model, got {type(env.unwrapped).__name__}; make one with "
@@ -124,7 +124,7 @@ def make(name: str, env: Any, /, **options: Any) -> Policy:
     return known.build(env, _assumed(env, chosen), chosen)
 
 
-def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
+def _residual_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     """A trained residual around its base, whose options may be given anew."""
     description = read_description(folder)
     task = env.unwrapped.task.name
@@ -142,8 +142,8 @@ def _residual(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
     return residual_policy(folder, base, env.unwrapped.assumed_model)
 
 
-def _learned(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
-    """What `iterative` has learned, around its base, whose options may be given."""
+def _learned_policy(folder: Path, env: Any, options: dict[str, Any]) -> Policy:
+    """Learned offsets around their base, whose options may be given."""
     description, table = load_table(folder, env)
     model: RobotModel = env.unwrapped.assumed_model
     base = make(description.base, env, **options)

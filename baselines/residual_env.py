@@ -15,10 +15,10 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from baselines.compensation.policy import Policy
+from baselines.compensation.policy import Policy, put_rows, select_rows
 from baselines.policies import make
 from baselines.residual.correction import Corrected
-from baselines.residual.features import Features
+from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError, shown
 from elastic_env.core.signals import Array, BoolArray
@@ -38,18 +38,21 @@ class _Deciding:
         self.features = Features(self.corrected)
         self._start = self._fresh = np.zeros(num_worlds, dtype=np.bool_)
         self._state: Any = None
-        self._past: Array | None = None
+        self._past: FeaturesMemory | None = None
 
     def begin(self, worlds: BoolArray) -> None:
         """Episodes begin in some worlds, a (num_worlds,) mask."""
-        self._start, self._fresh = self._start | worlds, self._fresh | worlds
+        self._start = self._start | worlds
+        self._fresh = self._fresh | worlds
         if worlds.all():
             self._state = self._past = None
 
     def observe(self, rows: Array, worlds: BoolArray | None = None) -> Array:
         """Features of the coming decision; the measurements count for some worlds only, or for all."""
         features, past = self.features.at(rows, self._past, self._fresh, self._state, self._start)
-        self._past = past if worlds is None or self._past is None else np.where(worlds[:, None], past, self._past)
+        if worlds is not None and self._past is not None:
+            past = put_rows(self._past, worlds, select_rows(past, worlds))
+        self._past = past
         self._fresh = np.zeros_like(self._fresh) if worlds is None else self._fresh & ~worlds
         return features
 
@@ -59,13 +62,13 @@ class _Deciding:
         self._start = np.zeros_like(self._start)
         return action
 
-    def decided(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
+    def read_residual(self, rows: Array, residual: Any, shape: tuple[int, ...]) -> Array:
         """A residual for the observations of its decision as numbers within [−1, 1], out of the mirror."""
         given = np.asarray(residual, dtype=np.float64)
         if given.shape != shape or not np.isfinite(given).all():
             raise ActionError(f"a residual must be finite numbers of shape {shape} within ±1, got {shown(residual)}")
         clipped = np.clip(given, -1.0, 1.0)
-        return self.features.turned_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
+        return self.features.turn_back(rows, clipped.reshape(len(rows), -1)).reshape(shape)
 
 
 ActsOn = Mapping[str, Bound | None]
@@ -124,8 +127,11 @@ class ResidualWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Rec
         """One decision."""
         if not self._last.size:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.decided(self._last[None], action, self.action_space.shape or ())[None]
-        total, terminated, truncated, info = 0.0, False, False, {}
+        residual = self._deciding.read_residual(self._last[None], action, self.action_space.shape or ())[None]
+        total = 0.0
+        terminated = False
+        truncated = False
+        info = {}
         for _ in range(self.settings.decision_period):
             command = self._deciding.act(self._last[None], residual)[0]
             self._last, reward, terminated, truncated, info = self.env.step(command)
@@ -176,11 +182,12 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         self._rows = np.zeros((env.num_envs, 0))
         self._last: Array | None = None
         self._done = np.zeros(env.num_envs, dtype=np.bool_)
-        self._decisions, self._cut_at = 0, np.zeros(env.num_envs, dtype=np.int64)
+        self._decisions = 0
+        self._cut_at = np.zeros(env.num_envs, dtype=np.int64)
 
     @property
     def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """What Gymnasium's wrappers ask for."""
+        """Metadata that Gymnasium's wrappers ask for."""
         return {**self.env.metadata, "autoreset_mode": self.autoreset_mode}
 
     @property
@@ -212,22 +219,22 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
         """One decision in every world."""
         if self._last is None:
             raise gymnasium.error.ResetNeeded("reset() comes before the first step()")
-        residual = self._deciding.decided(self._rows, actions, self.action_space.shape or ())
+        residual = self._deciding.read_residual(self._rows, actions, self.action_space.shape or ())
         waiting = self._done if self.autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._done)
         features, reward, terminated, truncated, info = self._decide(residual, ~waiting)
         self._decisions += 1
         truncated |= (self._cut_at == self._decisions) & ~terminated & ~waiting
         self._done = terminated | truncated
         if waiting.any():
-            features = self._restarted(waiting, features)
+            features = self._restart(waiting, features)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             ended = self._done.copy()
             info = final_of(features, info, ended)
-            features = self._restarted(ended, features)
+            features = self._restart(ended, features)
         self._last = features.copy()
         return features, reward, terminated, truncated, info
 
-    def _restarted(self, worlds: BoolArray, features: Array) -> Array:
+    def _restart(self, worlds: BoolArray, features: Array) -> Array:
         """Features with those of new episodes in some worlds."""
         self._rows, _ = self.env.reset(options={"reset_mask": worlds})
         self._done = self._done & ~worlds
@@ -237,7 +244,9 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
     def _decide(self, residual: Array, alive: BoolArray) -> Transition:
         """Hold a residual for a decision period in the worlds that are alive; the observation is of features."""
         n = self.num_envs
-        reward, terminated, truncated = np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        reward = np.zeros(n)
+        terminated = np.zeros(n, dtype=np.bool_)
+        truncated = np.zeros(n, dtype=np.bool_)
         final: Array | None = None
         metrics: dict[str, Any] = {}
         reason = np.full(n, "", dtype="<U16")
@@ -251,7 +260,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
                 # what they see last, with the memories as they are now: the others go on
                 last = self._deciding.observe(self._rows, ended)
                 final = last if final is None else np.where(ended[:, None], last, final)
-                terminated, truncated = terminated | (ended & fell), truncated | (ended & finished)
+                terminated = terminated | (ended & fell)
+                truncated = truncated | (ended & finished)
                 reason = np.where(ended, info["termination"], reason)
                 for name, values in info["episode_metrics"].items():
                     metrics[name] = np.where(ended, values, metrics.get(name, np.zeros_like(values)))
@@ -270,7 +280,8 @@ class ResidualVectorWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any]):
 @contextmanager
 def _no_restarts(env: Any) -> Iterator[None]:
     """Have worlds that end stay as they are for a step; whoever steps the environment itself finds it unchanged."""
-    mode, env.autoreset_mode = env.autoreset_mode, AutoresetMode.DISABLED
+    mode = env.autoreset_mode
+    env.autoreset_mode = AutoresetMode.DISABLED
     try:
         yield
     finally:

@@ -12,12 +12,12 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.estimators import mean_load
 from baselines.adaptation.online_stiffness import AdaptationGains, OnlineStiffness
 from baselines.compensation.compensators import PRESLIDING_RAD, presliding_friction
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import DeflectionSensors
-from baselines.estimation.joint_stiffness import StiffnessPrior, regressed
+from baselines.compensation.policy import PolicyInputs, Zero
+from baselines.estimation.joint_stiffness import StiffnessPrior, regress
 from baselines.policies import sensors_needed
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, SignalTable
 from tests.test_walk_policies import PERIOD_S, first, recording, scalar
 
 PRIOR = StiffnessPrior(common=0.4, own=0.15, offset_rad=0.003, noise_rad=0.004)
@@ -45,13 +45,13 @@ def test_regression_is_that_of_the_normal_equations() -> None:
     generator = np.random.default_rng(3)
     h = generator.normal(0.0, [0.03, 0.02, 0.001, 0.0], (40, 4))
     delta = 1.3 * h + generator.normal(0.0, 0.004, h.shape) + 0.002
-    np.testing.assert_allclose(regressed(sums_of(h, delta), PRIOR), by_matrices(h, delta), rtol=1e-9)
+    np.testing.assert_allclose(regress(sums_of(h, delta), PRIOR), by_matrices(h, delta), rtol=1e-9)
 
 
 def test_joints_without_load_take_after_the_others() -> None:
     """Catches a prior that keeps them at zero: with three joints at +0.4 the fourth is nearer to them than to 0."""
     h = np.outer(np.sin(np.arange(200.0)), [0.03, 0.03, 0.03, 0.0])
-    r = regressed(sums_of(h, 1.4 * h), PRIOR)
+    r = regress(sums_of(h, 1.4 * h), PRIOR)
     np.testing.assert_allclose(r[:3], 0.4, atol=0.01)
     assert 0.3 < r[3] < 0.4
 
@@ -78,8 +78,6 @@ def test_the_mean_load_starts_at_the_assumed_one() -> None:
 class Fixed:
     """An estimator that says the same of every joint."""
 
-    memory_width = 1
-
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 1))
 
@@ -87,35 +85,33 @@ class Fixed:
         return np.full((len(rows), 12), 0.5), memory + 1.0
 
 
-class Recorded:
+class Recorded(Zero):
     """A policy that keeps the corrections it gets."""
 
-    def __init__(self) -> None:
+    def __init__(self, table: SignalTable) -> None:
+        super().__init__(table)
         self.corrections: list[Array] = []
 
-    def predict_with(self, observation: Array, inputs: PolicyInputs, *call: Any) -> tuple[Array, Any]:
+    def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> tuple[Array, None]:
         assert inputs.deflection is not None
         self.corrections.append(inputs.deflection[0])
-        return np.zeros(12, np.float32), None
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        return observation
+        return super().act(rows, memory, inputs)
 
 
 def test_the_correction_is_filtered_and_joined_with_another() -> None:
     """First order in time, and (1 + r)(1 + r') − 1; an estimate is made once a period."""
     model = scalar().unwrapped.assumed_model
     gains = AdaptationGains(period_s=0.1, filter_s=0.2, limit=0.4)
-    inner = Recorded()
+    inner = Recorded(model.observation_table)
     policy, state = OnlineStiffness(inner, model, Fixed(), gains), None
     for step, observation in enumerate(recording()[:50]):
         further = PolicyInputs(deflection=np.full((1, 12), 0.1) if step == 49 else None)
-        _, state = policy.predict_with(observation, further, state, step == 0)
+        _, state = policy.predict(observation, state, step == 0, inputs=further)
     share = 1.0 - np.exp(-np.arange(1, 51) * PERIOD_S / gains.filter_s)
     expected = gains.limit * share  # the target of 0.5 is bounded
     np.testing.assert_allclose(np.array(inner.corrections)[:49, 3], expected[:49])
     np.testing.assert_allclose(inner.corrections[49], (1.0 + expected[49]) * 1.1 - 1.0)
-    assert state[0][0, -1] == 2  # estimates in 50 steps of 4 ms
+    assert state.estimator[0, 0] == 2  # estimates in 50 steps of 4 ms
 
 
 @cache
@@ -134,8 +130,7 @@ def walked(name: str, scenario: str = "ideal+soft") -> tuple[Any, Any, Array]:
 
 def correction(state: Any) -> Array:
     """Filtered r of the joints, (2 legs, 6)."""
-    memory = state[0] if len(state[0][0]) > 30 else state[1][0]
-    return memory[0, 13:25].reshape(2, 6)
+    return state.correction[0].reshape(2, 6)
 
 
 @pytest.mark.parametrize(("name", "joints"), [("adaptive", [1]), ("torque_sensor", [1]), ("link_encoder", [1, 3])])
@@ -190,7 +185,7 @@ def test_a_controller_that_weighs_the_robot_finds_its_load() -> None:
         for _ in range(200):
             action, state = policy.predict(observation, state)
             observation, *_ = env.step(action)
-        weights.append(state[0][0, -1] - env.unwrapped.assumed_model.biped.weight)
+        weights.append(state["weight"][0] - env.unwrapped.assumed_model.biped.weight)
     assert weights[0] == pytest.approx(5.0 * 9.81, abs=2.0)
     assert weights[1] == 0.0
 

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.estimation.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver
-from baselines.estimation.estimation_kernels import update
+from baselines.estimation.bending import DISAGREEMENT_RAD, MODEL_ERROR, OFFSET_RAD, BendingObserver, update
 from elastic_env.core.signals import Array
 
 

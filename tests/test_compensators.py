@@ -9,6 +9,7 @@ import pytest
 
 import baselines
 from baselines.compensation.compensators import (
+    DriveMemory,
     DynamicCompensator,
     GravityCompensator,
     Motion,
@@ -193,12 +194,13 @@ def test_unknown_output_method_names_itself_and_the_choices() -> None:
 
 
 @pytest.mark.parametrize("compensator", [GravityCompensator, DynamicCompensator])
-def test_memory_has_the_promised_width(compensator: type) -> None:
+def test_memory_has_a_row_for_every_world(compensator: type) -> None:
     """Catches a compensator whose rows do not fit the state that `Compensated` keeps for it."""
     made, motion = compensator(moving()), Motion(*np.zeros((3, 5, 1)))
     memory = made.begin(motion)
     offset, kept = made.offset(motion, memory)
-    assert memory.shape == kept.shape == (5, made.memory_width)
+    assert [part.shape for part in kept] == [part.shape for part in memory]
+    assert all(len(part) == 5 for part in ([memory] if isinstance(memory, np.ndarray) else memory))
     assert offset.shape == (5, 1)
 
 
@@ -259,7 +261,7 @@ def test_friction_turns_round_with_the_motion_and_stays_at_rest() -> None:
     frictions = []
     for rate in [0.5] * 20 + [0.0] * 5 + [-0.5] * 20:
         _, memory = compensator.offset(at(0.0, rate), memory)
-        frictions.append(float(memory[0, 3]))
+        frictions.append(float(memory.friction[0, 0]))
     assert frictions[19] == pytest.approx(5.4, abs=1e-6)
     assert frictions[20:25] == frictions[19:20] * 5
     assert -5.4 < frictions[25] < 0.0  # 2 mrad after the turn: past zero, not yet turned round
@@ -268,7 +270,7 @@ def test_friction_turns_round_with_the_motion_and_stays_at_rest() -> None:
 
 def test_without_friction_the_compensator_ignores_the_friction_of_the_model() -> None:
     """Catches friction that the `dynamic` policy is not meant to know."""
-    memory, offsets = np.zeros((1, 4)), []
+    memory, offsets = DriveMemory(*np.zeros((4, 1, 1))), []
     for friction in (0.0, 5.4):
         offsets.append(DynamicCompensator(moving(coulomb_friction=friction)).offset(at(0.2, 0.5, 0.1), memory)[0])
     np.testing.assert_array_equal(offsets[0], offsets[1])

@@ -32,9 +32,9 @@ ROOT = Path(__file__).parents[1]
 KERNELS = (
     "elastic_env.runtime.metrics", "elastic_env.dynamics.control_kernels",
     "elastic_env.dynamics.tree.kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.tree.end_effector",
-    "baselines.compensation.compensation_kernels", "baselines.walking.walking_kernels",
-    "baselines.estimation.estimation_kernels", "baselines.adaptation.adaptation_kernels",
-    "baselines.residual.residual_kernels",
+    "baselines.compensation.compensators", "baselines.compensation.contact_torque", "baselines.walking.controller",
+    "baselines.walking.posture", "baselines.walking.zmp_shift", "baselines.estimation.bending",
+    "baselines.residual.network",
 )  # fmt: skip
 
 
@@ -273,7 +273,8 @@ for step in range(6):
     steps = [policy.predict(row, state, start) for policy, state in zip(walk, states)]
     states, start = [state for _, state in steps], False
     row = env.step(steps[0][0])[0]
-    print(*[float(x) for action, _ in steps for x in action], *[float(x) for state in states for x in state[0][0]])
+    memories = [x for state in states for x in state.feedback[0].tolist()]
+    print(*[float(x) for action, _ in steps for x in action], *np.hstack(memories).tolist())
 assert np.isfinite(row).all() and len(row) == 95
 """
 

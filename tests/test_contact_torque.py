@@ -283,10 +283,11 @@ def test_gravity_in_the_pelvis_is_the_turned_vertical() -> None:
     attitudes, yaws = generator.uniform(-1.2, 1.2, (30, 2)), generator.uniform(-3.0, 3.0, 30)
     R = np.stack([rotation(attitude, yaw) for attitude, yaw in zip(attitudes, yaws, strict=True)])
     expected = R.swapaxes(-1, -2) @ [0.0, 0.0, -9.81]
-    np.testing.assert_allclose(gravity_in_pelvis(attitudes, 9.81), expected, rtol=0.0, atol=1e-14)
+    turned = [gravity_in_pelvis(*attitude, 9.81) for attitude in attitudes]
+    np.testing.assert_allclose(turned, expected, rtol=0.0, atol=1e-14)
     quaternion = np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=-1)  # w first
-    found = np.array([attitude_of(one)[:2] for one in quaternion])
-    np.testing.assert_allclose(gravity_in_pelvis(found, 9.81), expected, rtol=0.0, atol=1e-13)
+    turned = [gravity_in_pelvis(*attitude_of(one)[:2], 9.81) for one in quaternion]
+    np.testing.assert_allclose(turned, expected, rtol=0.0, atol=1e-13)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -9,6 +9,7 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
+from baselines.compensation.policy import put_rows, select_rows
 from baselines.residual.correction import Corrected
 from baselines.residual.evidence import ERROR_SCALE, LOAD_SCALE, Evidence, evidence
 from baselines.residual.features import Features
@@ -72,7 +73,7 @@ def walk(scenario: str, cautious: bool) -> tuple[Any, Any]:
             seen.append(g[:, 0])
         action, state = policy.predict(observation, state, np.full(2, step == 0))
         observation, *_ = envs.step(action)
-    return np.array(seen), state[1][0]
+    return np.array(seen), state.inner.values
 
 
 @pytest.mark.parametrize("scenario", ["nominal", "sensor"])
@@ -112,12 +113,13 @@ def test_evidence_is_of_the_episode_and_counted_once_per_decision() -> None:
             starting[0], begun[0] = True, step
             observation, _ = envs.reset(options={"reset_mask": starting})
         due = (step - begun) % PERIOD == 0
-        memory = np.where(starting[:, None], source.begin(2), memory)
-        memory = np.where(due[:, None], source.observe(observation, memory)[1], memory)
+        memory = put_rows(memory, starting, select_rows(source.begin(2), starting))
+        memory = put_rows(memory, due, select_rows(source.observe(observation, memory)[1], due))
         action, state = policy.predict(observation, state, starting)
-        np.testing.assert_array_equal(state[0][:, -source.memory_width :], memory)
+        np.testing.assert_array_equal(state.caution.loads, memory.loads)
+        np.testing.assert_array_equal(state.caution.bending, memory.bending)
         observation, *_ = envs.step(action)
-    assert memory[0, 0] == memory[1, 0] - 5.0 == 7.0
+    assert memory.loads[0, 0] == memory.loads[1, 0] - 5.0 == 7.0
 
 
 def test_only_a_walker_can_be_cautious() -> None:

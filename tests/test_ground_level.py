@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.estimation.bending import BendingObserver
-from baselines.estimation.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel
+from baselines.estimation.ground_level import TILT_RAD, VELOCITY_M_PER_S, GroundLevel, GroundMemory
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.ground_contact import zero_moment_point
 
@@ -30,7 +30,7 @@ def force(wrenches: Array) -> Array:
     return wrenches[:, :3] + wrenches[:, 6:9]
 
 
-def after_a_minute(ground: GroundLevel, rows: Array) -> tuple[Array, Array]:
+def after_a_minute(ground: GroundLevel, rows: Array) -> tuple[Array, GroundMemory]:
     """Values and memory for a robot that stands still."""
     values, memory = ground.observe(rows, ground.begin(len(rows)))
     for _ in range(600):
@@ -83,7 +83,7 @@ def test_slope_of_the_simulation_is_taken_off() -> None:
         ground, table = GroundLevel(model, PERIOD_S), model.observation_table
         rows = env.reset(seed=5)[0]
         values, memory = after_a_minute(ground, rows)
-        seen[scenario] = values, memory[:, 1:3], rows[:, table.group("imu_attitude")], rows[:, table.group("wrench")]
+        seen[scenario] = values, memory.mean, rows[:, table.group("imu_attitude")], rows[:, table.group("wrench")]
         zmp[scenario] = _zmp(values[:, 2:], model), _zmp(rows[:, table.group("wrench")], model)
     (level, none, attitude, wrench), (values, lean, tilted, leaning) = seen["ideal"], seen["ideal+slope"]
     np.testing.assert_allclose(none, 0.0, atol=1e-3)
@@ -108,20 +108,22 @@ def test_the_mean_forgets_and_waits_for_feet_that_are_loaded() -> None:
     model = walker("ideal").unwrapped.assumed_model
     ground, wrench = GroundLevel(model, PERIOD_S, mean_s=1.0), model.observation_table.group("wrench")
 
-    def mean(x: float, z: float, memory: Array) -> Array:
+    def mean(x: float, z: float, memory: GroundMemory) -> GroundMemory:
         rows = np.zeros((1, len(model.observation_table)))
         rows[:, wrench] = [x, 0.0, z, 0.0, 0.0, 0.0] * 2
         return ground.observe(rows, memory)[1]
 
     memory = mean(5.0, 300.0, ground.begin(1))
-    np.testing.assert_array_equal(memory[0], 0.0)
-    np.testing.assert_array_equal(mean(5.0, 10.0, memory), memory)
+    np.testing.assert_array_equal(np.hstack([part[0] for part in memory]), 0.0)
+    hanging = mean(5.0, 10.0, memory)
+    np.testing.assert_array_equal(np.hstack([part[0] for part in hanging]), 0.0)
     for number, x in enumerate((3.0, 6.0, 0.0), start=1):
         memory = mean(x, 300.0, memory)
-        np.testing.assert_allclose(memory[0, :3], [number, 0.0, -np.mean([3.0, 6.0, 0.0][:number]) / 300.0], atol=1e-15)
+        assert memory.number[0] == number
+        np.testing.assert_allclose(memory.mean[0], [0.0, -np.mean([3.0, 6.0, 0.0][:number]) / 300.0], atol=1e-15)
     for _ in range(200):
         memory = mean(0.0, 300.0, memory)
-    before = mean(3.0, 300.0, memory)[0, 2]
+    before = mean(3.0, 300.0, memory).mean[0, 1]
     np.testing.assert_allclose(before, -(1.0 - np.exp(-0.1)) * 0.01, rtol=1e-6)
 
 
@@ -140,7 +142,7 @@ def test_acceleration_and_certainty_have_their_closed_forms() -> None:
     assert np.abs(direction).min() > 0.01
     rows[:, table.group("wrench")] = [300.0 * direction[0], 300.0 * direction[1], 300.0, 0.0, 0.0, 0.0] * 2
     _, memory = ground.observe(rows[:1], ground.begin(1))
-    np.testing.assert_allclose(ground.observe(rows[1:], memory)[1][0, 1:3], 0.0, atol=1e-5)
+    np.testing.assert_allclose(ground.observe(rows[1:], memory)[1].mean[0], 0.0, atol=1e-5)
 
     tilt = np.array([direction[1], -direction[0]])  # the same force on a robot that stands: the ground leans
     for number in range(1, 20):

@@ -13,7 +13,7 @@ from safetensors.numpy import save
 import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.adaptation.iterative import IterativeLearner, Trial
-from baselines.adaptation.iterative_learning import ChannelGains, ahead, credible, updated, zero_phase
+from baselines.adaptation.iterative_learning import ChannelGains, lead_error, limit_surprise, update, zero_phase
 from baselines.adaptation.learned_signals import LearningGains, WalkSignals
 from baselines.adaptation.offset_table import DESCRIPTION, OFFSETS
 from baselines.policies import Track, track
@@ -64,7 +64,7 @@ def errors(disturbance: Array, plant: float, gains: ChannelGains, trials: int) -
     table, found = np.zeros_like(disturbance), []
     for trial in range(trials):
         found.append(disturbance - plant * table)
-        table = updated(table, found[-1], [gains], PERIOD_S, trial)
+        table = update(table, found[-1], [gains], PERIOD_S, trial)
     return found
 
 
@@ -119,13 +119,13 @@ def test_the_lead_makes_up_for_a_delay() -> None:
         table, disturbance = np.zeros((10_000, 1)), wave(3.0)
         for _ in range(12):
             error = disturbance - np.concatenate([np.zeros((delay, 1)), table[:-delay]])
-            wanted = error if lead < 0 else ahead(error, lead)
+            wanted = error if lead < 0 else lead_error(error, lead)
             table = zero_phase(table + 0.5 * wanted, 10.0, PERIOD_S)
         last[lead] = np.abs(middle(error)).max()
     assert last[delay] < 0.05
     assert last[0] > 2.0
     gains = ChannelGains(gain=1.0, lead_s=delay * PERIOD_S, cutoff_hz=20.0, surprise=1.0, limit=10.0)
-    table = updated(np.zeros((10_000, 1)), wave(1.0), [gains], PERIOD_S)
+    table = update(np.zeros((10_000, 1)), wave(1.0), [gains], PERIOD_S)
     np.testing.assert_allclose(middle(table), middle(wave(1.0, shift_s=delay * PERIOD_S)), atol=1e-4)
 
 
@@ -133,7 +133,7 @@ def test_an_error_may_shrink_but_not_suddenly_grow() -> None:
     """Catches a push that is learned, and an improvement that is taken for one."""
     before = np.array([5.0, 5.0, 5.0, -5.0, 0.0, 5.0])
     error = np.array([0.1, 9.0, -4.0, -4.0, 0.5, np.nan])
-    np.testing.assert_array_equal(credible(error, before, 1.0), [0.1, 6.0, -1.0, -4.0, 0.5, 0.0])
+    np.testing.assert_array_equal(limit_surprise(error, before, 1.0), [0.1, 6.0, -1.0, -4.0, 0.5, 0.0])
 
 
 def test_the_center_of_mass_moves_as_a_pendulum_has_to() -> None:
@@ -234,7 +234,7 @@ def test_a_trial_that_fails_teaches_nothing_and_is_a_reason_to_retreat() -> None
     table = np.full((1, 50, 1), 0.01)
     trial = Trial(3, np.full((1, 50, 1), 0.2), np.array([True]), [{}])
     before = np.full((1, 50, 1), 0.03)
-    following, kept = learner()._learned(table, before, trial)
+    following, kept = learner()._learn(table, before, trial)
     np.testing.assert_array_equal(following, 0.5 * table)
     np.testing.assert_array_equal(kept, before)
 
@@ -247,7 +247,7 @@ def test_a_push_in_one_trial_is_forgotten() -> None:
     disturbance = 0.02 * np.sin(np.linspace(0.0, 4.0 * np.pi, 1500))[:, None]
     for number in range(10):
         error = disturbance - tables[0] + (pushed if number == 4 else 0.0)
-        tables, before = policy._learned(tables, before, Trial(number, error[None], np.array([False]), [{}]))
+        tables, before = policy._learn(tables, before, Trial(number, error[None], np.array([False]), [{}]))
         if number == 4:
             worst = np.abs(disturbance - tables[0])[300:-300].max()
     assert worst < 0.008  # of 0.1

@@ -16,8 +16,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
+from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.compensation.compensators import GravityCompensator
-from baselines.compensation.policy import Zero
+from baselines.compensation.policy import Zero, select_rows
 from baselines.walking.controller import WalkingGains
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
@@ -169,7 +170,7 @@ def test_state_of_another_number_of_worlds_is_an_error(name: str) -> None:
     observation, _ = env.reset(seed=0)
     _, state = policy.predict(observation)
     with pytest.raises(ElasticError, match="2, got 1"):
-        policy.predict(observation, (state[0][:1], state[1]))
+        policy.predict(observation, select_rows(state, np.array([True, False])))
 
 
 @pytest.mark.parametrize("name", WITH_MEMORY)
@@ -318,6 +319,14 @@ def test_unknown_policy_names_itself_and_the_choices() -> None:
     assert "Did you mean 'input'?" in str(caught.value)
     assert all(name in str(caught.value) for name in NAMES)
     assert set(baselines.policy_names()) >= set(NAMES)
+
+
+def test_the_table_of_make_has_every_policy_where_it_is() -> None:
+    """Catches a policy that the docs leave out, or promise on a robot that does not have it."""
+    rows = [line.strip(" |").split(" | ") for line in (baselines.make.__doc__ or "").splitlines() if "| `" in line]
+    for column, known in ((1, ON_JOINTS), (2, ON_THE_WALKER)):
+        named = {name for row in rows for name in re.findall(r"`(\w+)`", row[0]) if row[column] != "–"}
+        assert named == set(known)
 
 
 def test_unknown_option_names_itself_and_the_choices() -> None:
@@ -490,7 +499,7 @@ def test_state_of_the_wrapped_policy_travels_inside() -> None:
     for _ in range(4):
         action, state = policy.predict(observation, state)
         observation, *_ = env.step(action)
-    assert state[1] == {"calls": 4}
+    assert state.inner.state == [{"calls": 4}]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ import pytest
 
 import baselines
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
-from baselines.compensation.compensation_kernels import shifted_share
-from baselines.compensation.inputs import INPUTS, PolicyInputs, input_signals, inputs_of
+from baselines.compensation.contact_torque import shifted_share
+from baselines.compensation.inputs import INPUTS, input_signals, inputs_of
+from baselines.compensation.policy import PolicyInputs
 from baselines.policies import sensors_needed
 from baselines.residual.correction import Corrected
 from baselines.residual.features import Features
@@ -21,8 +22,8 @@ from baselines.residual.mirror import Mirror
 from baselines.residual.residual import ResidualPolicy, read_description, shipped
 from baselines.residual.settings import ResidualSettings
 from baselines.residual_env import ResidualVectorWrapper
-from baselines.walking.walking_kernels import followed, move_pelvis_in_rows
-from baselines.walking.zmp_shift import Stances, following_share
+from baselines.walking.controller import follow_zmp
+from baselines.walking.zmp_shift import Stances, following_share, move_pelvis
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.leg_kinematics import foot_pose
@@ -114,14 +115,15 @@ def test_a_pelvis_that_moves_leaves_the_feet_where_they_were() -> None:
     model = model_of(walker())
     stances, shift = Stances.of(model), np.array([0.012, -0.02])
     offset = np.zeros(model.plan.q.shape)
-    move_pelvis_in_rows(stances.legs, stances.rows, np.broadcast_to(shift, (len(offset), 2)), offset)
+    steps = np.arange(len(offset))
+    move_pelvis(stances.legs, stances.rows, steps, np.tile(shift, (len(offset), 1)), offset)
     legs = (model.plan.q + offset).reshape(-1, 2, 6)
     ankle, R = foot_pose(model.biped.leg, legs)
     pelvis = model.plan.pelvis + np.append(shift, 0.0)
     np.testing.assert_allclose(pelvis[:, None] + model.biped.hips + ankle, model.plan.ankles, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(R, np.broadcast_to(np.eye(3), R.shape), rtol=0.0, atol=1e-9)
     far = np.zeros((1, 12))
-    move_pelvis_in_rows(stances.legs, stances.rows[:1], np.array([[0.5, 0.0]]), far)
+    move_pelvis(stances.legs, stances.rows, steps[:1], np.array([[0.5, 0.0]]), far)
     ankle, _ = foot_pose(model.biped.leg, (model.plan.q[:1] + far).reshape(-1, 2, 6))
     np.testing.assert_allclose(np.linalg.norm(ankle, axis=-1), stances.legs[0].reach, rtol=1e-9)
 
@@ -161,7 +163,7 @@ def test_gains_change_by_the_share_that_they_are_told() -> None:
         change = np.array([[0.5]])
         without = baselines.make(base, env, **_switched_off(base, options)).predict(tilted)[0]
         values: Any = {name: change}
-        changed, _ = policy.predict_with(tilted, PolicyInputs(**values))  # type: ignore[attr-defined]
+        changed, _ = policy.predict(tilted, inputs=PolicyInputs(**values))  # type: ignore[attr-defined]
         assert np.abs(plain - without).max() > 1e-5
         np.testing.assert_allclose(changed - without, 1.5 * (plain - without), atol=2e-8, rtol=1e-4)
 
@@ -177,7 +179,7 @@ def test_a_shift_of_the_center_of_mass_is_the_bounded_one() -> None:
     omega, period, p = 3.7, 0.004, np.array([0.01, -0.02])
     c, path = np.zeros(2), [np.zeros(2)]
     for _ in range(200):
-        c = followed.py_func(c, p, following_share(omega, period))
+        c = follow_zmp.py_func(c, p, following_share(omega, period))
         path.append(c)
     time = period * np.arange(201)[:, None]
     np.testing.assert_allclose(path, p * (1.0 - np.exp(-omega * time)), atol=1e-15)
@@ -204,7 +206,7 @@ def test_the_force_difference_control_wants_the_shifted_loads() -> None:
     def action(force_difference: float, **values: Array) -> Array:
         gains = {"force_difference": force_difference, "dcm": 0.0}
         policy: Any = baselines.make("uncompensated", env, gains=gains, ramp_s=0.004)
-        return policy.predict_with(observation, PolicyInputs(**values))[0].astype(np.float64)
+        return policy.predict(observation, inputs=PolicyInputs(**values))[0].astype(np.float64)
 
     zmp = np.array([[0.0, shift]])
     found = (action(gain, zmp=zmp) - action(0.0, zmp=zmp)) - (action(gain) - action(0.0))
@@ -235,7 +237,7 @@ def test_what_is_decided_in_the_mirror_is_turned_back() -> None:
     for name, (other, sign) in SIGNS.items():
         residual = np.zeros((2, len(names)))
         residual[:, names.index(name)] = 0.7
-        left, right = features.turned_back(rows, residual)
+        left, right = features.turn_back(rows, residual)
         np.testing.assert_array_equal(left, residual[0])
         expected = np.zeros(len(names))
         expected[names.index(other)] = sign * 0.7

@@ -10,7 +10,7 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.policies import Track, sensors_needed, track
 from baselines.walking.foot_balance import FootBalance, FootBalanceGains
-from baselines.walking.hip_torque import HipTorque, HipTorqueGains, filtered, limited_in_rate
+from baselines.walking.hip_torque import HipTorque, HipTorqueGains, limit_rate, low_pass
 from baselines.walking.stance_roll import StanceRoll, StanceRollGains, stance_roll
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
@@ -151,7 +151,7 @@ def test_the_low_pass_is_first_order() -> None:
     """Catches a cut-off in rad/s and a period left out: after 1/(2π f) a step has reached 1 − 1/e."""
     value, steps = np.zeros(1), round(1.0 / (2.0 * np.pi * 1.0 * PERIOD_S))
     for _ in range(steps):
-        value = filtered(value, np.ones(1), 1.0, PERIOD_S)
+        value = low_pass(value, np.ones(1), 1.0, PERIOD_S)
     assert value[0] == pytest.approx(1.0 - np.exp(-2.0 * np.pi * PERIOD_S * steps), rel=1e-12)
     assert value[0] == pytest.approx(1.0 - np.exp(-1.0), abs=5e-3)
 
@@ -159,7 +159,7 @@ def test_the_low_pass_is_first_order() -> None:
 def test_the_rate_limit_is_of_the_offset() -> None:
     """Catches a limit per step instead of per time, and one that holds in one direction alone."""
     values = np.array([0.01, -0.01, 5e-6])
-    np.testing.assert_allclose(limited_in_rate(np.zeros(3), values, 0.003, PERIOD_S), [12e-6, -12e-6, 5e-6])
+    np.testing.assert_allclose(limit_rate(np.zeros(3), values, 0.003, PERIOD_S), [12e-6, -12e-6, 5e-6])
 
 
 class Still:
@@ -196,7 +196,7 @@ def test_the_hip_leads_by_its_filtered_torque_over_k() -> None:
     assert np.count_nonzero(np.delete(offsets, ROLLS, axis=1)) == 0
 
 
-def test_the_hip_is_bounded_and_limited_in_rate() -> None:
+def test_the_hip_is_bounded_and_limit_rate() -> None:
     """Catches a bound before the division, and a limit that is left out: 0.003 rad/s up to 0.01 rad."""
     quick = torques(HipTorqueGains(cutoff_hz=1e3), 60.0, 0.5, 1000)[:, 1]
     time = PERIOD_S * np.arange(1, 1001)

@@ -25,8 +25,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 import baselines
 from baselines.compensation.inputs import input_signals
 from baselines.estimation.bending import BendingObserver
-from baselines.residual.channels import Channels
-from baselines.residual.correction import Corrected
+from baselines.residual.correction import Channels, Corrected
 from baselines.residual.features import Features
 from baselines.residual.residual import (
     Network,
@@ -179,7 +178,7 @@ def test_joints_and_bounds_are_chosen_by_name() -> None:
 
     def acting(**settings: Any) -> dict[str, float]:
         channels = Channels(model, ResidualSettings(**settings))
-        all_of_it = channels.towards(np.zeros((1, channels.width)), np.ones((1, len(channels.signals))), 1.0)
+        all_of_it = channels.approach(np.zeros((1, len(channels.bounds))), np.ones((1, len(channels.signals))), 1.0)
         assert all_of_it.tolist() == [channels.bounds.tolist()]
         columns = [signal.name for name in settings["acts_on"] for signal in input_signals(name, model)]
         return {name: bound for name, bound in zip(columns, channels.bounds.tolist(), strict=True) if bound}

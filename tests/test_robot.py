@@ -284,7 +284,7 @@ def test_link_encoders_tell_the_stiffness_of_every_joint() -> None:
         action, state = policy.predict(observation, state)
         observation, _, terminated, truncated, info = env.step(action)
         done = terminated or truncated
-    correction = 1.0 + state[0][0, 5:9]
+    correction = 1.0 + state.correction[0]
     np.testing.assert_allclose(correction[1:3], 1.0 / factor[1:3], rtol=0.02)
     np.testing.assert_allclose(policy.link_estimate(observation, state), env.unwrapped.truth().q[0], atol=1e-3)
     fixed = metrics_of(scalar(scenario="ideal+spread", timestep_s=0.001), "dynamic")["end_effector_error_rms_m"]

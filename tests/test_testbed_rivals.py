@@ -109,7 +109,7 @@ def test_the_observer_finds_a_torque_of_known_size_in_the_stated_time() -> None:
     policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
     for step, row in enumerate(rows_of_a_link(env, torque)):
         action, state = policy.predict(row, state, np.array([step == 0]))
-        found.append(policy.disturbance(state)[0, 0])
+        found.append(state.joints.disturbance[0, 0])
     T, T_v, time = 0.3, 0.03, PERIOD_S * (np.arange(100, 500) - 99)
     expected = 6.0 * (1.0 - (T * np.exp(-time / T) - T_v * np.exp(-time / T_v)) / (T - T_v))
     np.testing.assert_allclose(found[:100], 0.0, atol=1e-9)
@@ -133,7 +133,7 @@ def test_the_link_returns_from_a_torque_that_holds_it_back() -> None:
     uncompensated, _, _ = played(baselines.make("dynamic", env), env)
     assert uncompensated[-1, 0] == pytest.approx(6.0 / 1061.0, rel=0.02)
     assert abs(errors[-1, 0]) < 0.02 * uncompensated[-1, 0]
-    assert states[-1][0][0, -1] == pytest.approx(6.0, rel=0.02)
+    assert states[-1].joints.disturbance[0, 0] == pytest.approx(6.0, rel=0.02)
 
 
 def test_the_estimate_is_bounded_and_does_not_wind_up() -> None:
@@ -143,7 +143,7 @@ def test_the_estimate_is_bounded_and_does_not_wind_up() -> None:
     policy, state, found = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None, []
     for step, row in enumerate(rows_of_a_link(env, torque)):
         _, state = policy.predict(row, state, np.array([step == 0]))
-        found.append(policy.disturbance(state)[0, 0])
+        found.append(state.joints.disturbance[0, 0])
     assert max(found) == 2.0
     assert abs(found[-1]) < 0.3
 
@@ -154,7 +154,7 @@ def test_at_rest_what_friction_can_hold_is_no_disturbance() -> None:
     policy, state = DisturbanceObserver(Still(), env.unwrapped.assumed_model, gains), None
     for step, row in enumerate(rows_of_a_link(env, np.full(100, FRICTION - 0.1))):
         _, state = policy.predict(row, state, np.array([step == 0]))
-    assert abs(policy.disturbance(state)[0, 0]) < 1.0
+    assert abs(state.joints.disturbance[0, 0]) < 1.0
 
 
 @pytest.mark.parametrize(("middle", "expected"), [(0.0, 1.7e-3), (0.5, 0.0)])
@@ -162,7 +162,7 @@ def test_the_imu_is_zeroed_where_the_joint_hangs(middle: float, expected: float)
     """Catches a load that is taken for an offset, and an offset of the wrong sign."""
     env = made(reference={**HANGING, "middle": middle}, scenario="nominal")
     _, states, _ = played(baselines.make("disturbance_observer", env), env, steps=200)
-    assert states[-1][0][0, 1] == pytest.approx(expected, abs=1e-4)
+    assert states[-1].joints.offset[0, 0] == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("scenario", ["nominal", "soft", "stiff", "payload", "backlash", "sensor"])

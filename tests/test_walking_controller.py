@@ -457,10 +457,10 @@ def test_predict_changes_neither_state_nor_observation() -> None:
     walker = model(scenario="nominal")
     controller, observations = WalkingController(walker, **AT_ONCE), episodes(walker, 2, 2)
     _, state = controller.predict(observations[0], None, np.ones(2, dtype=np.bool_))
-    kept, before = state[0].copy(), observations[1].copy()
+    kept, before = state.copy(), observations[1].copy()
     again = [controller.predict(observations[1], state)[0] for _ in range(2)]
     np.testing.assert_array_equal(again[0], again[1])
-    np.testing.assert_array_equal(state[0], kept)
+    np.testing.assert_array_equal(state, kept)
     np.testing.assert_array_equal(observations[1], before)
 
 

@@ -8,10 +8,10 @@ import pytest
 
 import baselines
 import elastic_env  # noqa: F401  registers the environments
-from baselines.compensation.inputs import PolicyInputs
+from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, SignalTable
 
 OFFSET_M = np.array([0.011, -0.004])
 STEPS = 500
@@ -25,18 +25,17 @@ def vector(scenario: str = "nominal") -> Any:
     )  # fmt: skip
 
 
-class Recorder:
+class Recorder(Zero):
     """A policy that notes how far it is asked to shift the ZMP."""
 
-    inputs = ("zmp",)
-
-    def __init__(self) -> None:
+    def __init__(self, table: SignalTable) -> None:
+        super().__init__(table)
         self.shifts: list[Array] = []
 
-    def predict_with(self, observation: Array, inputs: PolicyInputs, *_: Any) -> tuple[Array, None]:
+    def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> tuple[Array, None]:
         assert inputs.zmp is not None
         self.shifts.append(inputs.zmp.copy())
-        return np.zeros((len(observation), 12), dtype=np.float32), None
+        return super().act(rows, memory, inputs)
 
 
 def standing(env: Any) -> Array:
@@ -61,18 +60,19 @@ def standing(env: Any) -> Array:
 def test_a_constant_error_is_integrated_up_to_the_limit() -> None:
     """Catches a wrong sign, a foot that weighs nothing, a rate per step in place of per second, and no limit."""
     env = vector()
-    model, recorder = env.unwrapped.task.assumed_model, Recorder()
+    model = env.unwrapped.task.assumed_model
+    recorder = Recorder(model.observation_table)
     policy = ZmpOffset(recorder, model, ZmpOffsetGains(time_constant_s=2.0, limit_m=0.008))
     rows, state = standing(env), None
     for step in range(STEPS):
-        _, state = policy.predict_with(rows, PolicyInputs(), state, np.full(2, step == 0))
+        _, state = policy.predict(rows, state, np.full(2, step == 0))
     time_s = np.arange(1, STEPS + 1) * model.control_period_s
     expected = np.clip(-OFFSET_M * time_s[:, None] / 2.0, -0.008, 0.008)
     assert abs(expected[-1, 0]) == 0.008 > abs(expected[-1, 1])
     shifts = np.array(recorder.shifts)
     np.testing.assert_allclose(shifts[:, 0], expected, atol=1e-12)
     np.testing.assert_allclose(shifts[:, 1], 0.0, atol=1e-12)
-    policy.predict_with(rows, PolicyInputs(zmp=np.full((2, 2), 0.01)), state, np.array([True, False]))
+    policy.predict(rows, state, np.array([True, False]), inputs=PolicyInputs(zmp=np.full((2, 2), 0.01)))
     np.testing.assert_allclose(recorder.shifts[-1][0], 0.01 - OFFSET_M * time_s[0] / 2.0, atol=1e-12)
     np.testing.assert_allclose(recorder.shifts[-1][1], 0.01, atol=1e-12)
 

@@ -1,1 +1,1 @@
-"""What is learned on the robot itself, while it moves or from one motion to the next."""
+"""Learning on the robot itself, while it moves or from one motion to the next."""

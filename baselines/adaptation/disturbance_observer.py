@@ -32,28 +32,25 @@ Mechatronics 1(1).
 Conf. Robotics and Automation.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
 from baselines.compensation.compensators import GravityCompensator, presliding_friction
 from baselines.compensation.gravity_torque import make_dynamics
 from baselines.compensation.measured import require_sensor
-from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
 from baselines.compensation.startup import Ramp
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import RobotModel
 
-LINK_IMU, _LINK_ANGLE = "link_imu", "link_angle_imu"
+LINK_IMU = "link_imu"
+_LINK_ANGLE = "link_angle_imu"
 """Sensor, and its column."""
-_MEMORY: tuple[str, ...] = (
-    "offset", "imu", "deflection", "friction", "smooth_deflection", "smooth_q", "smooth_friction", "rate",
-    "disturbance",
-)  # fmt: skip
-"""What is kept of every joint, in order."""
 _UNLOADED_RAD = 1e-3
 """Largest deflection of a joint that counts as unloaded [rad]."""
 
@@ -67,14 +64,46 @@ class ObserverGains(Model):
     )
     limit_nm: float = quantity("N·m", 30.0, gt=0, description="largest disturbance that is compensated")
     friction: bool = True
-    """Whether the model's Coulomb friction is known, and no disturbance. It must be as in the policy inside."""
+    """The model's Coulomb friction is known, and no disturbance. It must be as in the policy inside."""
     zero_s: float = quantity("s", 0.5, ge=0, description="time in which the IMU is zeroed at the start, 0 for never")
 
 
-class DisturbanceObserver:
-    """Any policy of a joint with the observed disturbance compensated, see the module.
+class JointObservation(NamedTuple):
+    """Memory of the observer for every joint, (num_worlds, n) each.
 
-    Memory: steps, then per joint what `_MEMORY` names.
+    Attributes:
+        offset: By how much the IMU shows too little [rad].
+        imu: Its last angle [rad].
+        deflection: δ where encoder and IMU were new [rad].
+        friction: Coulomb friction that holds the link back [N·m].
+        smooth_deflection: δ behind the filter of all measurements [rad].
+        smooth_q: The link angle behind it [rad].
+        smooth_friction: The friction behind it [N·m].
+        rate: The rate of the link behind it [rad/s].
+        disturbance: Torque that the model lacks; positive holds the link back [N·m].
+    """
+
+    offset: Array
+    imu: Array
+    deflection: Array
+    friction: Array
+    smooth_deflection: Array
+    smooth_q: Array
+    smooth_friction: Array
+    rate: Array
+    disturbance: Array
+
+
+class ObserverMemory(NamedTuple):
+    """Control steps since the start of the episode, (num_worlds, 1), what is kept of the joints, and of the policy."""
+
+    steps: IntArray
+    joints: JointObservation
+    inner: Any
+
+
+class DisturbanceObserver(PolicyAround):
+    """Any policy of a joint with the observed disturbance compensated, see the module.
 
     Args:
         policy: What commands the robot.
@@ -89,79 +118,91 @@ class DisturbanceObserver:
     def __init__(
         self, policy: Policy, model: RobotModel, gains: ObserverGains | None = None, ramp_s: float = STAND_S
     ) -> None:
-        self._policy, self._model, self._gains = policy, model, gains or ObserverGains()
-        table, self._dt = model.observation_table, model.control_period_s
+        table = model.observation_table
+        super().__init__(policy, table, model.control_period_s)
         require_sensor(table, LINK_IMU, _LINK_ANGLE)
-        self._view, self._imu = ObservationView(table, self._dt), table.group(_LINK_ANGLE)
+        self._model = model
+        self._gains = gains or ObserverGains()
+        self._dt = model.control_period_s
+        self._imu = table.group(_LINK_ANGLE)
         self._static = GravityCompensator(model)
         self._body = make_dynamics(model, self._static.gravity)
-        self._follows, self._smooths = (
-            1.0 - float(np.exp(-self._dt / time)) for time in (self._gains.time_constant_s, self._gains.rate_filter_s)
-        )
+        self._follow_share = 1.0 - float(np.exp(-self._dt / self._gains.time_constant_s))
+        self._smooth_share = 1.0 - float(np.exp(-self._dt / self._gains.rate_filter_s))
         self._zero_steps = round(self._gains.zero_s / self._dt)
         self._coulomb = self._gains.friction * model.coulomb_friction
-        self._ramp = Ramp(model, ramp_s)
+        self._ramp = Ramp(model, ramp_s).table
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Action and new state."""
-        rows = self._view.rows(observation)
-        memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._begin(rows))
-        action, inner = self._policy.predict(observation, inner, episode_start, deterministic)
-        memory = self._observed(rows, memory)
-        lead = self._ramp.after(memory[:, :1]) * self.disturbance((memory, inner)) / self._model.stiffness
-        total = np.asarray(action, dtype=np.float64) + lead.reshape(np.shape(action))
-        return total.astype(np.float32), (memory, inner)
+    @property
+    @override
+    def inputs(self) -> tuple[str, ...]:
+        return ()
 
-    def disturbance(self, state: Any) -> Array:
-        """Torque that the model lacks, of a state, (num_worlds, n) [N·m]; positive holds the link back."""
-        n = len(self._model.joint_names)
-        return np.asarray(state[0][:, -n:])
+    @override
+    def begin(self, rows: Array) -> ObserverMemory:
+        imu = rows[:, self._imu].copy()
+        deflection = self.view.theta(rows) - imu
+        zero = np.zeros_like(imu)
+        joints = JointObservation(
+            offset=zero,
+            imu=imu,
+            deflection=deflection,
+            friction=zero,
+            smooth_deflection=deflection,
+            smooth_q=imu,
+            smooth_friction=zero,
+            rate=zero,
+            disturbance=zero,
+        )
+        return ObserverMemory(np.zeros((len(rows), 1), dtype=np.int64), joints, self.policy.begin(rows))
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """The IMU's angle without its offset, (..., n) [rad]."""
-        n = len(self._model.joint_names)
-        return observation[..., self._imu] + state[0][:, 1 : 1 + n].reshape((*observation.shape[:-1], n))
+    @override
+    def act(self, rows: Array, memory: ObserverMemory, inputs: PolicyInputs) -> tuple[Array, ObserverMemory]:
+        action, inner = self.policy.act(rows, memory.inner, inputs)
+        steps = memory.steps + 1
+        joints = self._observe(rows, steps, memory.joints)
+        lead = self._ramp.take(steps, mode="clip") * joints.disturbance / self._model.stiffness
+        return (action + lead).astype(np.float32), ObserverMemory(steps, joints, inner)
 
-    def _begin(self, rows: Array) -> Array:
-        imu, theta = rows[:, self._imu], self._view.theta(rows)
-        at_rest = dict(zip(_MEMORY, np.zeros((len(_MEMORY), *imu.shape)), strict=True))
-        at_rest |= {"imu": imu, "deflection": theta - imu, "smooth_deflection": theta - imu, "smooth_q": imu}
-        return np.hstack([np.zeros((len(rows), 1)), *at_rest.values()])
+    @override
+    def link_angles(self, rows: Array, memory: ObserverMemory) -> Array:
+        """The IMU's angle without its offset, (num_worlds, n) [rad]."""
+        return rows[:, self._imu] + memory.joints.offset
 
-    def _observed(self, rows: Array, memory: Array) -> Array:
-        """Memory after a control step."""
-        gains, model = self._gains, self._model
-        theta, imu = self._view.theta(rows), rows[:, self._imu]
-        steps, was = memory[:, :1] + 1.0, dict(zip(_MEMORY, np.split(memory[:, 1:], len(_MEMORY), axis=1), strict=True))
+    def _observe(self, rows: Array, steps: IntArray, was: JointObservation) -> JointObservation:
+        """Memory of the joints after a control step."""
+        gains = self._gains
+        model = self._model
+        theta = self.view.theta(rows)
+        imu = rows[:, self._imu].copy()
+        q_ref_dot = self.view.motion(rows).q_dot
         is_zeroing = steps <= self._zero_steps
-        offset = was["offset"] + is_zeroing * (self._disagreement(theta, imu) - was["offset"]) / steps
+        offset = was.offset + is_zeroing * (self._disagreement(theta, imu) - was.offset) / steps
         # between two samples of the IMU the encoder goes on: the deflection is known where both are new
-        is_new = (imu != was["imu"]) | is_zeroing
-        deflection = np.where(is_new, theta - imu - offset, was["deflection"])
-        friction = presliding_friction(was["friction"], self._view.motion(rows).q_dot * self._dt, self._coulomb)
+        is_new = (imu != was.imu) | is_zeroing
+        deflection = np.where(is_new, theta - imu - offset, was.deflection)
+        friction = presliding_friction(was.friction, q_ref_dot * self._dt, self._coulomb)
 
-        def smooth(name: str, value: Array) -> tuple[Array, Array]:
-            """A value behind the filter that all have in common, and its rate."""
-            smoothed = np.where(is_zeroing, value, was[name] + self._smooths * (value - was[name]))
-            return smoothed, (value - smoothed) / gains.rate_filter_s
+        def smooth(value: Array, before: Array) -> Array:
+            """A value behind the filter that all have in common."""
+            return np.where(is_zeroing, value, before + self._smooth_share * (value - before))
 
-        delta, delta_dot = smooth("smooth_deflection", deflection)
-        q, q_dot = smooth("smooth_q", theta - deflection)
-        known, _ = smooth("smooth_friction", friction)
+        delta = smooth(deflection, was.smooth_deflection)
+        delta_dot = (deflection - delta) / gains.rate_filter_s
+        q = smooth(theta - deflection, was.smooth_q)
+        q_dot = (theta - deflection - q) / gains.rate_filter_s
+        known = smooth(friction, was.smooth_friction)
         passed = joint_torque(delta, delta_dot, model.stiffness, model.damping, model.backlash)
-        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was["rate"]) / self._dt)
+        needed = self._body.inverse_dynamics(q, q_dot, (q_dot - was.rate) / self._dt)
         # at rest dry friction takes any value up to F: only what is beyond is a disturbance
-        left = passed - needed - was["disturbance"]
-        stands = self._view.motion(rows).q_dot == 0.0
-        rubs = np.where(stands, np.clip(left, -self._coulomb, self._coulomb), known)
+        left = passed - needed - was.disturbance
+        rubs = np.where(q_ref_dot == 0.0, np.clip(left, -self._coulomb, self._coulomb), known)
         missing = np.where(is_zeroing, 0.0, passed - needed - rubs)
-        disturbance = was["disturbance"] + self._follows * (missing - was["disturbance"])
+        disturbance = was.disturbance + self._follow_share * (missing - was.disturbance)
         disturbance = np.clip(disturbance, -gains.limit_nm, gains.limit_nm)
-        return np.hstack([steps, offset, imu, deflection, friction, delta, q, known, q_dot, disturbance])
+        return JointObservation(offset, imu, deflection, friction, delta, q, known, q_dot, disturbance)
 
     def _disagreement(self, theta: Array, imu: Array) -> Array:
         """By how much the IMU shows too little, where there is no load that bends the joint, else 0 [rad]."""
-        q = self._static.link_angle(theta, theta)
+        q = self._static.link_angle(theta)
         return np.where(np.abs(theta - q) < _UNLOADED_RAD, q - imu, 0.0)

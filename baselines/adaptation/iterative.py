@@ -6,27 +6,32 @@ it is given, which may be hardware. What it has learned is a table of offsets ov
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.adaptation.iterative_learning import credible, updated
+from baselines.adaptation.iterative_learning import limit_surprise, update
 from baselines.adaptation.learned_signals import LearnedSignals
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Action, ObservationView, Policy, PolicyAround, predicted, taken_up
+from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.runtime.robot_model import RobotModel
 
 _RETREAT = 0.5
 """Share of the offsets that is kept after a trial that failed, such as by a fall."""
 
 
+class LearnedMemory(NamedTuple):
+    """Control steps since the start of the episode, (num_worlds,), and the memory of the policy."""
+
+    steps: IntArray
+    inner: Any
+
+
 class LearnedOffsets(PolicyAround):
     """Any policy with a table of offsets added, row by row from the start of an episode.
-
-    Memory per world: control steps since the start, then that of the policy.
 
     Args:
         policy: What commands the robot.
@@ -39,12 +44,12 @@ class LearnedOffsets(PolicyAround):
     """
 
     def __init__(self, policy: Policy, model: RobotModel, signals: LearnedSignals, ramp_s: float) -> None:
-        self._policy, self._signals, self._ramp = policy, signals, Ramp(model, ramp_s)
+        super().__init__(policy, model.observation_table, model.control_period_s)
+        self._signals = signals
+        self._ramp = Ramp(model, ramp_s)
         self._period_s = model.control_period_s
-        self._view = ObservationView(model.observation_table, self._period_s)
-        self._n = len(model.joint_names)
         self.tables = np.zeros((1, 1, len(signals.names)))
-        self._offsets = np.zeros((1, 1, self._n))
+        self._offsets = np.zeros((1, 1, len(model.joint_names)))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -57,34 +62,26 @@ class LearnedOffsets(PolicyAround):
         self._offsets = np.stack([self._signals.offsets(share * table) for table in tables])
         self.tables = tables
 
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Action, Any]:
-        """Action and new state; all inputs are passed on."""
-        rows = self._view.rows(observation)
-        begun = np.zeros((len(rows), 1))
-        steps, inner = taken_up(state, episode_start, rows, self._view, lambda: begun)
-        action, inner = predicted(self._policy, observation, inputs, inner, episode_start, deterministic)
-        steps = steps + 1.0
-        total = np.asarray(action, dtype=np.float64) + self._at(steps[:, 0]).reshape(np.shape(action))
-        return total.astype(np.float32), (steps, inner)
+    @override
+    def begin(self, rows: Array) -> LearnedMemory:
+        return LearnedMemory(np.zeros(len(rows), dtype=np.int64), self.policy.begin(rows))
 
-    def _at(self, steps: Array) -> Array:
-        """Offsets at a control step of every world, (num_worlds, n) [rad]; behind the table its last row."""
-        tables, row = len(self._offsets), np.minimum(steps.astype(np.int64), self._offsets.shape[1] - 1)
-        if tables not in (1, len(steps)):
-            raise ElasticError(f"the offsets were learned in {tables} worlds, one each, and are played in {len(steps)}")
-        return self._offsets[np.arange(len(steps)) if tables > 1 else 0, row]
+    @override
+    def act(self, rows: Array, memory: LearnedMemory, inputs: PolicyInputs) -> tuple[Array, LearnedMemory]:
+        """After the last row of the table its offsets stay."""
+        action, inner = self.policy.act(rows, memory.inner, inputs)
+        steps = memory.steps + 1
+        tables = len(self._offsets)
+        if tables not in (1, len(rows)):
+            raise ElasticError(f"the offsets were learned in {tables} worlds, one each, and are played in {len(rows)}")
+        row = np.minimum(steps, self._offsets.shape[1] - 1)
+        offsets = self._offsets[np.arange(len(rows)) if tables > 1 else 0, row]
+        return (action + offsets).astype(np.float32), LearnedMemory(steps, inner)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of a trial.
+    """Result of a trial.
 
     Attributes:
         number: Of the trial, 0 for the first, which has no offsets yet.
@@ -129,29 +126,27 @@ class IterativeLearner(LearnedOffsets):
         """
         stage = Stage(env, seed)
         shape = (stage.num_worlds, stage.num_steps + 1, len(self._signals.names))
-        tables, before = np.zeros(shape), np.full(shape, np.inf)
+        tables = np.zeros(shape)
+        before = np.full(shape, np.inf)
         for number in range(self.trials):
             self.play(tables)
             trial = stage.trial(self, self._signals, number)
-            tables, before = self._learned(tables, before, trial)
+            tables, before = self._learn(tables, before, trial)
             if told is not None:
                 told(trial)
         self.play(tables)
 
-    def _learned(self, tables: Array, before: Array, trial: Trial) -> tuple[Array, Array]:
+    def _learn(self, tables: Array, before: Array, trial: Trial) -> tuple[Array, Array]:
         """Tables of the next trial, and what was credible of the errors."""
-        surprise = np.array([gains.surprise for gains in self._signals.gains])
+        gains = self._signals.gains
+        surprise = np.array([own.surprise for own in gains])
         # where nothing came before, all is credible
         known = np.where(np.isfinite(before), before, np.nan_to_num(trial.error))
-        error = credible(trial.error, known, surprise)
-        following = np.stack(
-            [
-                updated(*pair, self._signals.gains, self._period_s, trial.number)
-                for pair in zip(tables, error, strict=True)
-            ]
-        )
+        errors = limit_surprise(trial.error, known, surprise)
+        pairs = zip(tables, errors, strict=True)
+        following = np.stack([update(table, error, gains, self._period_s, trial.number) for table, error in pairs])
         failed = trial.failed[:, None, None]
-        return np.where(failed, _RETREAT * tables, following), np.where(failed, before, error)
+        return np.where(failed, _RETREAT * tables, following), np.where(failed, before, errors)
 
 
 class Stage:
@@ -164,18 +159,21 @@ class Stage:
 
     def __init__(self, env: Any, seed: int) -> None:
         count = getattr(env.unwrapped, "num_envs", None)
-        self._env, self._is_scalar, self.num_worlds = env, count is None, count or 1
+        self._env = env
+        self._is_scalar = count is None
+        self.num_worlds = count or 1
         self.num_steps: int = env.unwrapped.task.num_steps
         self._robots = [seed + world for world in range(self.num_worlds)]
 
     def trial(self, policy: Policy, signals: LearnedSignals, number: int) -> Trial:
         """Play an episode in every world. Its noise depends on the robot's seed and the number of the trial alone."""
         n = self.num_worlds
-        seeds = [_seed_of_noise(robot, number) for robot in self._robots]
-        seen = self._reset(seeds)
+        seen = self._reset([_seed_of_noise(robot, number) for robot in self._robots])
         error = np.full((n, self.num_steps + 1, len(signals.names)), np.nan)
-        over, failed, state = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), None
+        over = np.zeros(n, dtype=np.bool_)
+        failed = np.zeros(n, dtype=np.bool_)
         metrics: list[Mapping[str, float]] = [{}] * n
+        state = None
         start = np.ones(n, dtype=np.bool_)
         for step in range(1, self.num_steps + 1):
             action, state = policy.predict(seen, state=state, episode_start=start, deterministic=True)
@@ -186,7 +184,8 @@ class Stage:
             error[running, step] = signals.error(asked, seen, info)[running]
             for world in np.flatnonzero(start & ~over).tolist():
                 metrics[world] = {name: float(value) for name, value in self._metrics_of(info, world)}
-            over, failed = over | start, failed | (terminated & ~over)
+            failed = failed | (terminated & ~over)
+            over = over | start
             if over.all():
                 break
         return Trial(number, error, failed, metrics)

@@ -65,12 +65,12 @@ def zero_phase(table: Array, cutoff_hz: float, period_s: float) -> Array:
     return signal.sosfiltfilt(sections, table, axis=0, padlen=min(longest, len(table) - 1))
 
 
-def ahead(error: Array, steps: int) -> Array:
-    """The error some steps later at every step, (T, ...); its last value behind the end."""
+def lead_error(error: Array, steps: int) -> Array:
+    """Error that comes some steps later, at every step, (T, ...); its last value behind the end."""
     return np.concatenate([error[steps:], np.repeat(error[-1:], min(steps, len(error)), axis=0)])[: len(error)]
 
 
-def credible(error: Array, before: Array, surprise: float | Array) -> Array:
+def limit_surprise(error: Array, before: Array, surprise: float | Array) -> Array:
     """An error as far as that of the trial before makes it credible, elementwise.
 
     Args:
@@ -78,11 +78,12 @@ def credible(error: Array, before: Array, surprise: float | Array) -> Array:
         before: What was credible in the trial before.
         surprise: By how much an error can grow, in its unit.
     """
-    low, high = np.minimum(before, 0.0) - surprise, np.maximum(before, 0.0) + surprise
+    low = np.minimum(before, 0.0) - surprise
+    high = np.maximum(before, 0.0) + surprise
     return np.clip(np.nan_to_num(error), low, high)
 
 
-def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float, trial: int = 0) -> Array:
+def update(table: Array, error: Array, gains: Sequence[ChannelGains], period_s: float, trial: int = 0) -> Array:
     """Offsets of the next trial, see the module.
 
     Args:
@@ -94,8 +95,7 @@ def updated(table: Array, error: Array, gains: Sequence[ChannelGains], period_s:
     """
     following = np.empty_like(table)
     for column, own in enumerate(gains):
-        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain_of(trial) * ahead(
-            error[:, column], round(own.lead_s / period_s)
-        )
+        leading = lead_error(error[:, column], round(own.lead_s / period_s))
+        wanted = (1.0 - own.forgetting) * table[:, column] + own.gain_of(trial) * leading
         following[:, column] = np.clip(zero_phase(wanted, own.cutoff_hz, period_s), -own.limit, own.limit)
     return following

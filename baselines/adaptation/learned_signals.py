@@ -1,4 +1,4 @@
-r"""What is learned from trial to trial: which measured errors, and which offsets of the joints correct them.
+r"""Signals that are learned from trial to trial: which measured errors, and which offsets of the joints correct them.
 
 | robot | error, by sensors alone | correction |
 |---|---|---|
@@ -10,10 +10,12 @@ A positive offset of both hip rolls turns the pelvis to a negative roll, so the 
 the links follow their offsets, so their error is what was asked less what was measured.
 """
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
+from typing_extensions import override
 
 from baselines.adaptation.iterative_learning import ChannelGains
 from baselines.compensation.measured import LINK_ENCODER
@@ -52,22 +54,22 @@ class LearnedSignals(Protocol):
     gains: tuple[ChannelGains, ...]
     """Of the columns."""
 
+    @abstractmethod
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        """What was measured after a control step, (num_worlds, k); nan where nothing was.
+        """Errors measured after a control step, (num_worlds, k); nan where nothing was measured.
 
         Args:
             asked: Observations before the step, whose reference is that of its end, (num_worlds, m).
             seen: Observations after it.
             info: What the environment says of it.
         """
-        ...
 
+    @abstractmethod
     def offsets(self, table: Array) -> Array:
         """Offsets of the joints for a table over time, (T, k) to (T, n) [rad]."""
-        ...
 
 
-class WalkSignals:
+class WalkSignals(LearnedSignals):
     """Attitude and ZMP of a walker, see the module.
 
     Args:
@@ -79,12 +81,15 @@ class WalkSignals:
 
     def __init__(self, model: WalkerModel, gains: LearningGains) -> None:
         self.gains = (gains.attitude, gains.attitude, gains.zmp_x, gains.zmp_y)
-        self._model, table = model, model.observation_table
-        self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
+        table = model.observation_table
+        self._model = model
+        self._attitude = table.group("imu_attitude")
+        self._wrench = table.group("wrench")
         self._zmp = table.group("zmp_reference")
 
-    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:  # noqa: ARG002  the interface's
-        """See `LearnedSignals`; of the ZMP as if the feet were flat where they are planned."""
+    @override
+    def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
+        """Tilt, and error of the ZMP as if the feet were flat where they are planned, (num_worlds, 4)."""
         return np.hstack([seen[:, self._attitude], asked[:, self._zmp] - self.measured_zmp(seen)])
 
     def measured_zmp(self, seen: Array) -> Array:
@@ -92,12 +97,12 @@ class WalkSignals:
         biped = self._model.biped
         return biped.zmp_on_footholds(seen[:, self._wrench], _LEAST_LOAD * biped.weight)
 
+    @override
     def offsets(self, table: Array) -> Array:
-        """See `LearnedSignals`."""
         return hip_offsets(table[:, :2]) + zmp_shift_offsets(self._model, table[:, 2:])
 
 
-class JointSignals:
+class JointSignals(LearnedSignals):
     """Links of a robot on a fixed base, see the module.
 
     Args:
@@ -109,7 +114,8 @@ class JointSignals:
     """
 
     def __init__(self, model: RobotModel, gains: LearningGains) -> None:
-        joints, table = model.joint_names, model.observation_table
+        joints = model.joint_names
+        table = model.observation_table
         self.names = tuple(f"{joint}_rad" for joint in joints)
         self.gains = (gains.joint,) * len(joints)
         self._reference = table.group("reference_angle")
@@ -121,16 +127,16 @@ class JointSignals:
                 f"sensors=[{LINK_ENCODER!r}]"
             )
 
+    @override
     def error(self, asked: Array, seen: Array, info: Mapping[str, Any]) -> Array:
-        """See `LearnedSignals`."""
         link = np.reshape(info[LINK_IMU], (-1, 1)) if self._encoder is None else seen[:, self._encoder]
         return asked[:, self._reference] - link
 
+    @override
     def offsets(self, table: Array) -> Array:
-        """See `LearnedSignals`."""
         return table
 
 
 def learned_signals(model: RobotModel, gains: LearningGains) -> LearnedSignals:
-    """What is learned of a robot."""
+    """Signals that are learned of a robot."""
     return WalkSignals(model, gains) if isinstance(model, WalkerModel) else JointSignals(model, gains)

@@ -1,4 +1,4 @@
-"""What `iterative` has learned, as a folder: `iterative.json` and `offsets.safetensors`.
+"""Learned offsets of `iterative` as a folder: `iterative.json` and `offsets.safetensors`.
 
 The table has a row for every control step of the motion and a column for every learned signal, in SI units. Loading it
 runs no code from it. It plays in an environment of the same robot, motion and control period alone.
@@ -18,12 +18,14 @@ from elastic_env.core.files import write_whole
 from elastic_env.core.signals import Array
 from elastic_env.core.tensors import read_tensors
 
-DESCRIPTION, OFFSETS = "iterative.json", "offsets.safetensors"
-_TENSOR, _LARGEST = "offsets", 1.0
+DESCRIPTION = "iterative.json"
+OFFSETS = "offsets.safetensors"
+_TENSOR = "offsets"
+_LARGEST = 1.0
 
 
 class TableDescription(Model):
-    """What `iterative.json` says of the table beside it."""
+    """Content of `iterative.json`, about the table beside it."""
 
     robot: Title
     """Task of the environment, walker or testbed."""
@@ -67,7 +69,7 @@ def save_table(folder: Path, description: TableDescription, table: Array) -> Non
 
 
 def read_table_description(folder: Path) -> TableDescription:
-    """What a table says of itself.
+    """Description of a table.
 
     Raises:
         ConfigurationError: There is none, or it is not valid.
@@ -124,7 +126,8 @@ def _require_same(folder: Path, description: TableDescription, table: Array, env
             raise ConfigurationError(f"{folder} was learned with the {what} {learned!r}, the environment has {given!r}")
     motion = motion_of(env)
     for key in {**motion, **description.motion}:
-        learned, given = description.motion.get(key), motion.get(key)
+        learned = description.motion.get(key)
+        given = motion.get(key)
         if learned != given:
             raise ConfigurationError(
                 f"{folder} was learned for a motion with {key} {shown(learned)}, the environment has {shown(given)}; "

@@ -1,21 +1,45 @@
 """Joint elasticity compensated around any policy (Fig. 2 of the paper)."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.compensation_kernels import shift_seen
 from baselines.compensation.compensators import Compensator
-from baselines.compensation.inputs import DEFLECTION, PolicyInputs, inputs_of
-from baselines.compensation.observed import ObservedWalk
-from baselines.compensation.policy import Action, ObservationView, Policy, PolicyWithInputs, predicted, taken_up
+from baselines.compensation.contact_torque import shift_plan
+from baselines.compensation.inputs import DEFLECTION
+from baselines.compensation.policy import (
+    Motion,
+    Policy,
+    PolicyAround,
+    PolicyInputs,
+    WalkView,
+    put_rows,
+    select_rows,
+)
 from baselines.compensation.startup import Ramp
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import WalkerModel
 
 
-class Compensated(PolicyWithInputs):
+class CompensatedMemory(NamedTuple):
+    """Memory of a compensated policy.
+
+    Attributes:
+        steps: Control steps since the start of the episode, (num_worlds, 1).
+        links: Link angles that the policy saw, (num_worlds, n) [rad].
+        compensator: Memory of the compensator.
+        inner: Memory of the policy.
+    """
+
+    steps: IntArray
+    links: Array
+    compensator: Any
+    inner: Any
+
+
+class Compensated(PolicyAround):
     """Any policy with joint elasticity compensated around it (Fig. 2 of the paper).
 
     The wrapped policy's action is the offset of the link angle it wants, q_d = q_ref + a. It sees the estimated link
@@ -38,74 +62,72 @@ class Compensated(PolicyWithInputs):
         ramp_s: float = STAND_S,
         corrects_policy: bool = False,
     ) -> None:
-        self.policy, self.compensator, self._corrects_policy = policy, compensator, corrects_policy
         model = compensator.model
-        self._num_joints = len(model.joint_names)
-        self._shows_rates = getattr(policy, "reads_rates", True)
-        self._view = ObservationView(model.observation_table, model.control_period_s)
-        self._ramp = Ramp(model, ramp_s)
-        self._plan = None
+        super().__init__(policy, model.observation_table, model.control_period_s)
+        self.compensator = compensator
+        self._theta = model.observation_table.group("encoder_angle")
+        self._corrects_policy = corrects_policy
+        self._ramp = Ramp(model, ramp_s).table
+        self._plan: tuple[WalkView, float] | None = None
         if isinstance(model, WalkerModel):
-            self._plan = ObservedWalk(model.observation_table), model.biped.foot_spacing
+            self._plan = WalkView(model.observation_table), model.biped.foot_spacing
 
     @property
+    @override
     def inputs(self) -> tuple[str, ...]:
-        """See `PolicyWithInputs`."""
-        return (DEFLECTION, *inputs_of(self.policy)[1:])
+        return (DEFLECTION, *self.policy.inputs)
 
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Action, Any]:
-        """See `PolicyWithInputs`; it takes `deflection`, r: what is compensated, and seen, is (1 + r) δ.
+    @override
+    def begin(self, rows: Array) -> CompensatedMemory:
+        motion = self.view.motion(rows)
+        memory = self.compensator.at(rows).begin(motion)
+        steps = np.zeros((len(rows), 1), dtype=np.int64)
+        return CompensatedMemory(steps, motion.q.copy(), memory, self.policy.begin(rows))
 
-        The contact forces that load the joints act where the policy shifts the ZMP.
+    @override
+    def act(self, rows: Array, memory: CompensatedMemory, inputs: PolicyInputs) -> tuple[Array, CompensatedMemory]:
+        """It takes the input `deflection`, r: what is compensated, and seen, is (1 + r) δ.
+
+        The contact forces that load the joints act where the inputs shift the ZMP.
         """
-        rows, n, correction = self._shifted(self._view.rows(observation), inputs), self._num_joints, inputs.deflection
-        desired, compensator = self._view.motion(rows), self.compensator.at(rows)
-        memory, inner_state = taken_up(
-            state, episode_start, rows, self._view, lambda: np.pad(compensator.begin(desired), ((0, 0), (1 + n, 0)))
-        )
-        own = memory[:, 1 + n :]
-        links = self._links(compensator, rows, own, correction)
-        seen = self._seen(compensator, rows, links)
-        shown = seen if observation.ndim > 1 else seen[0]
-        others = inputs if self._corrects_policy else inputs.with_deflection(None)
-        action, inner_state = predicted(self.policy, shown, others, inner_state, episode_start, deterministic)
-        action = np.atleast_2d(np.asarray(action, dtype=np.float64))
-        offset, kept = compensator.offset(desired.shifted(action), own)
+        correction = inputs.deflection
+        own = memory.compensator
+        if self._plan is not None and (shift := inputs.zmp_shift) is not None:
+            rows = _shift_rows(*self._plan, rows, shift)
+            own = self._begin_shifted(rows, memory)
+        compensator = self.compensator.at(rows)
+        theta = rows[:, self._theta]
+        links = compensator.link_angle(theta, own)
         if correction is not None:
-            offset = offset + correction * compensator.deflection(offset, kept)
-        steps = memory[:, :1] + 1.0
-        total = (action + self._ramp.after(steps) * offset).astype(np.float32)
-        return total.reshape((*observation.shape[:-1], n)), (np.concatenate((steps, links, kept), axis=1), inner_state)
+            links = links - compensator.modelled * correction * (theta - links)
+            if not self._corrects_policy:
+                inputs = inputs._replace(deflection=None)
+        rates = compensator.link_rate(theta, self.view.theta_dot(rows)) if self.policy.reads_rates else None
+        action, inner = self.policy.act(self.view.with_links(rows, links, rates), memory.inner, inputs)
+        wanted = action.astype(np.float64)
+        motion = self.view.motion(rows)
+        offset, own = compensator.offset(Motion(motion.q + wanted, motion.q_dot, motion.q_ddot), own)
+        if correction is not None:
+            offset = offset + correction * compensator.deflection(offset, own)
+        steps = memory.steps + 1
+        total = (wanted + self._ramp.take(steps, mode="clip") * offset).astype(np.float32)
+        return total, CompensatedMemory(steps, links.copy(), own, inner)
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `PolicyWithInputs`."""
-        memory, _ = state
-        return memory[:, 1 : 1 + self._num_joints].reshape((*observation.shape[:-1], self._num_joints))
+    @override
+    def link_angles(self, rows: Array, memory: CompensatedMemory) -> Array:
+        return memory.links
 
-    def _shifted(self, rows: Array, inputs: PolicyInputs) -> Array:
-        """The observations with ZMP and load share of the plan as the inputs shift them."""
-        shift = inputs.zmp_shift
-        if shift is None or self._plan is None:
-            return rows
-        rows, (observed, spacing) = rows.copy(), self._plan
-        shift_seen(observed.fields(rows), np.ascontiguousarray(shift), spacing)
-        return rows
+    def _begin_shifted(self, rows: Array, memory: CompensatedMemory) -> Any:
+        """Memory of the compensator, begun under the shifted plan where an episode begins."""
+        if np.count_nonzero(memory.steps) == len(rows):
+            return memory.compensator
+        fresh = memory.steps[:, 0] == 0
+        begun = self.compensator.at(rows).begin(self.view.motion(rows))
+        return put_rows(memory.compensator, fresh, select_rows(begun, fresh))
 
-    def _links(self, compensator: Compensator, rows: Array, memory: Array, correction: Array | None) -> Array:
-        """The links' angles by the encoders."""
-        theta = self._view.theta(rows)
-        q = compensator.link_angle(theta, memory)
-        return q if correction is None else q - compensator.modelled * correction * (theta - q)
 
-    def _seen(self, compensator: Compensator, rows: Array, links: Array) -> Array:
-        """The observations with the links' angles and rates where they have the encoders'."""
-        theta_dot = self._view.theta_dot(rows)
-        rate = compensator.link_rate(self._view.theta(rows), theta_dot) if self._shows_rates else theta_dot
-        return self._view.with_links(rows, links, rate)
+def _shift_rows(view: WalkView, spacing: float, rows: Array, shift: Array) -> Array:
+    """The observations with ZMP and load share of the plan shifted."""
+    rows = rows.copy()
+    shift_plan(view.fields(rows), shift=np.ascontiguousarray(shift), spacing=spacing)
+    return rows

@@ -6,31 +6,30 @@ compensator says where the link is when the motor encoder shows θ. All work on 
 [Dahl1968] P. R. Dahl, "A Solid Friction Model", The Aerospace Corporation, TOR-0158(3107-18)-1.
 """
 
+import math
+from abc import abstractmethod
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.compensation_kernels import DRIVE, lead
 from baselines.compensation.contact_torque import LegTorque
-from baselines.compensation.gravity_torque import GravityMethod, GravityModel, make_dynamics, make_gravity, make_load
+from baselines.compensation.gravity_torque import (
+    FixedGravity,
+    GravityMethod,
+    GravityModel,
+    make_dynamics,
+    make_gravity,
+    make_load,
+)
+from baselines.compensation.policy import Motion
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
 from elastic_env.runtime.robot_model import RobotModel
 
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]
-
-
-class Motion(NamedTuple):
-    """Desired motion of the links, (..., n) each [rad], [rad/s], [rad/s²]."""
-
-    q: Array
-    q_dot: Array
-    q_ddot: Array
-
-    def shifted(self, offset: Array) -> "Motion":
-        """The motion with its angles moved by an offset [rad]."""
-        return Motion(self.q + offset, self.q_dot, self.q_ddot)
 
 
 def input_offset(q_desired: Array, stiffness: Array, gravity: GravityModel, servo_compliance: Parameter = 0.0) -> Array:
@@ -68,7 +67,7 @@ def taylor_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
         ElasticError: The matrix is singular.
     """
     if isinstance(gravity, LegTorque):
-        return theta - gravity.solved(theta, stiffness)
+        return theta - gravity.solve(theta, stiffness)
     return theta - _solve(gravity, theta, stiffness, gravity.gravity_torque(theta))
 
 
@@ -78,45 +77,41 @@ def newton_link_angle(theta: Array, stiffness: Array, gravity: GravityModel) -> 
 
 
 class Compensator(Protocol):
-    """What `baselines.Compensated` needs: an input offset for a motion, and a link angle for an encoder angle.
+    """An input offset for a motion, and a link angle for an encoder angle: what `baselines.Compensated` needs.
 
-    `memory` has one row per world and `memory_width` columns; a compensator without memory has none.
+    `memory` has one row per world: an array, or a named tuple of arrays.
     """
 
     model: RobotModel
-    memory_width: int
+    modelled: float | Array = 1.0
+    """1 where its link angles follow from the model, 0 where sensors show them; a number, or (n,) [1]."""
 
-    @property
-    def modelled(self) -> float | Array:
-        """1 where its link angles follow from the model, 0 where sensors show them; a number, or (n,) [1]."""
-        ...
-
+    @abstractmethod
     def at(self, rows: Array) -> "Compensator":
         """The compensator for the loads at the control steps of observations, (num_worlds, m)."""
-        ...
 
-    def begin(self, motion: Motion) -> Array:
-        """Memory at rest at the start of an episode, (num_worlds, memory_width)."""
-        ...
+    @abstractmethod
+    def begin(self, motion: Motion) -> Any:
+        """Memory at rest at the start of an episode."""
 
-    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
+    @abstractmethod
+    def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
         """Command offset for the coming control period, (num_worlds, n) [rad], and the new memory."""
-        ...
 
-    def deflection(self, offset: Array, memory: Array) -> Array:
+    @abstractmethod
+    def deflection(self, offset: Array, memory: Any) -> Array:
         """The deflection δ that an offset leads by, of what `offset` returned, (num_worlds, n) [rad]."""
-        ...
 
-    def link_angle(self, theta: Array, memory: Array) -> Array:
+    @abstractmethod
+    def link_angle(self, theta: Array, memory: Any) -> Array:
         """Estimate of q from the encoders, (num_worlds, n) [rad]."""
-        ...
 
+    @abstractmethod
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
         """Estimate of q̇ from the encoders, (num_worlds, n) [rad/s]."""
-        ...
 
 
-class GravityCompensator:
+class GravityCompensator(Compensator):
     """The paper's compensator: Eq. 9 on the input, Eq. 12 (or Newton on Eq. 10) on the output.
 
     Args:
@@ -129,64 +124,81 @@ class GravityCompensator:
         ConfigurationError: Unknown output method or gravity method, or one that the robot does not have.
     """
 
-    memory_width = 0
-    modelled: float | Array = 1.0
-
     def __init__(self, model: RobotModel, output: OutputMethod = "taylor", method: GravityMethod | None = None) -> None:
         require_known("output compensator", [output], get_args(OutputMethod))
         self.model = model
-        self.stiffness, self._servo_compliance = model.stiffness, model.servo_compliance
+        self.stiffness = model.stiffness
+        self._servo_compliance = model.servo_compliance
         self._per_deflection = 1.0 + self.stiffness * self._servo_compliance
-        self.gravity = self._load = make_gravity(model, method)
-        """τ_g of the desired posture and of the measured one."""
-        self._source, self._load_source = self.gravity, make_load(model, output, self.gravity)
-        self._loads_alike = self._load_source is self._source
+        self.gravity = make_gravity(model, method)
+        """τ_g of the desired posture."""
+        self._load = make_load(model, output, self.gravity)  # of the measured posture
         self._output = output
 
+    @override
     def at(self, rows: Array) -> "GravityCompensator":
-        """See `Compensator`."""
-        bound = alike(self)
-        if self._loads_alike:
-            bound.gravity, bound._load = self._source.level_and_tilted(rows)
+        if isinstance(self.gravity, FixedGravity):
+            return self
+        bound = shallow_copy(self)
+        if self._load is self.gravity:
+            bound.gravity, bound._load = self.gravity.level_and_tilted(rows)
         else:
-            bound.gravity, bound._load = self._source.at(rows), self._load_source.at(rows, level=False)
+            bound.gravity = self.gravity.at(rows)
+            bound._load = self._load.at(rows)
         return bound
 
+    @override
     def begin(self, motion: Motion) -> Array:
-        """See `Compensator`."""
-        return np.zeros((*motion.q.shape[:-1], 0))
+        return np.zeros((len(motion.q), 0))
 
+    @override
     def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        """See `Compensator`."""
         return input_offset(motion.q, self.stiffness, self.gravity, self._servo_compliance), memory
 
-    def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
-        """See `Compensator`: all of the offset but what the servo itself gives way."""
+    @override
+    def deflection(self, offset: Array, memory: Array) -> Array:
+        """All of the offset but what the servo itself gives way, (num_worlds, n) [rad]."""
         return offset / self._per_deflection
 
-    def link_angle(self, theta: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
-        """See `Compensator`."""
+    @override
+    def link_angle(self, theta: Array, memory: Array | None = None) -> Array:
+        """Estimate of q from the encoders, (num_worlds, n) [rad]; it needs no memory."""
         if self._output == "none":
             return theta
         solve = newton_link_angle if self._output == "newton" else taylor_link_angle
         return solve(theta, self.stiffness, self._load)
 
+    @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """See `Compensator`: the derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇ at the estimated link angle."""
+        """The derivative of Eq. 10, (K + ∂τ_g/∂q) q̇ = K θ̇, at the estimated link angle, (num_worlds, n) [rad/s]."""
         if self._output == "none":
             return theta_dot
-        q = self.link_angle(theta, theta)
+        q = self.link_angle(theta)
         return _solve(self._load, q, self.stiffness, self.stiffness * theta_dot)
 
 
-class DynamicCompensator:
+class DriveMemory(NamedTuple):
+    """Memory of the drives, (num_worlds, n) each.
+
+    Attributes:
+        deflection: δ, by which the motor side leads [rad].
+        rate: δ̇ [rad/s].
+        windup: Integral of the servo error, ∫e [rad·s].
+        friction: Coulomb friction that holds the link back [N·m].
+    """
+
+    deflection: Array
+    rate: Array
+    windup: Array
+    friction: Array
+
+
+class DynamicCompensator(Compensator):
     r"""Deflection from the full joint torque of the motion, and the inverse of the servo.
 
     The link's inverse dynamics give τ_J; the transmission with its damping, K δ + D δ̇ = τ_J, gives δ; the rotor and the
     servo, B θ̈ + τ_J = k_p e − k_v θ̇ + k_i ∫e, give the servo error e that the motion θ = q + δ needs. The command is
     θ + e, taken at the middle of the control period over which it is held.
-
-    Memory per joint: δ, δ̇, ∫e, friction torque.
 
     Args:
         model: Assumed robot, with a servo on every joint.
@@ -194,8 +206,6 @@ class DynamicCompensator:
         method: How the static torque is computed; None for the robot's default.
         friction: Whether the model's Coulomb friction is part of the joint torque.
     """
-
-    modelled: float | Array = 1.0
 
     def __init__(
         self,
@@ -206,67 +216,140 @@ class DynamicCompensator:
     ) -> None:
         self.model = model
         self._static = GravityCompensator(model, output, method)
-        self._body = self._source = make_dynamics(model, self._static.gravity)
+        self._body = make_dynamics(model, self._static.gravity)
         self._measures = output == "wrench"
-        self._n, self._dt = len(model.joint_names), model.control_period_s
-        self._K = model.stiffness[None]
+        self._dt = model.control_period_s
+        self._stiffness = model.stiffness[None]
         self._backlash: Parameter = model.backlash if model.backlash.any() else 0.0
-        self._viscous, self._coulomb = model.viscous_friction, model.coulomb_friction if friction else None
-        self._drives: Any = np.zeros(self._n, DRIVE)
-        self._drives["damping"], self._drives["rotor_inertia"] = model.damping, model.rotor_inertia
+        self._viscous = model.viscous_friction
+        self._coulomb = model.coulomb_friction if friction else None
+        self._drives: Any = np.zeros(len(model.joint_names), DRIVE)
+        self._drives["damping"] = model.damping
+        self._drives["rotor_inertia"] = model.rotor_inertia
         for name in ("position_gain", "velocity_gain", "integral_gain"):
             self._drives[name] = [getattr(servo, name) for servo in model.servos]
-        self.memory_width = 4 * self._n
 
+    @override
     def at(self, rows: Array) -> "DynamicCompensator":
-        """See `Compensator`."""
-        bound = alike(self)
-        bound._static = self._static.at(rows)
-        bound._body = self._source.at(rows, bound._static.gravity)
+        static = self._static.at(rows)
+        if static is self._static:
+            return self
+        bound = shallow_copy(self)
+        bound._static = static
+        bound._body = self._body.at(rows, static.gravity)
         return bound
 
     def with_stiffness(self, stiffness: Array) -> "DynamicCompensator":
         """The compensator with another K, also one for every world, (..., n) [N·m/rad]."""
-        stiffer = alike(self)
-        stiffer._K = np.ascontiguousarray(stiffness).reshape(-1, self._n)
+        stiffer = shallow_copy(self)
+        stiffer._stiffness = np.ascontiguousarray(stiffness).reshape(-1, len(self._drives))
         return stiffer
 
-    def begin(self, motion: Motion) -> Array:
-        """See `Compensator`."""
+    @override
+    def begin(self, motion: Motion) -> DriveMemory:
         torque = self._static.gravity.gravity_torque(motion.q)
         integral_gain = self._drives["integral_gain"]
-        windup = np.divide(torque, integral_gain, out=np.zeros_like(torque), where=integral_gain > 0.0)
-        deflection = static_deflection(torque, self._K, self._backlash)
         zero = np.zeros_like(torque)
-        return np.concatenate([deflection, zero, windup, zero], axis=-1)
+        windup = np.divide(torque, integral_gain, out=zero.copy(), where=integral_gain > 0.0)
+        deflection = static_deflection(torque, self._stiffness, self._backlash)
+        return DriveMemory(deflection, rate=zero, windup=windup, friction=zero)
 
-    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        """See `Compensator`."""
-        offset, kept, friction = np.empty(motion.q.shape), np.empty(memory.shape), memory[:, 3 * self._n :]
+    @override
+    def offset(self, motion: Motion, memory: DriveMemory) -> tuple[Array, DriveMemory]:
+        """Offset that moves the links along a motion, (num_worlds, n) [rad], and the memory for the next step.
+
+        The springs settle towards K⁻¹ τ within a control period; the servo lags by its own PID.
+        """
         torque = self._body.inverse_dynamics(motion.q, motion.q_dot, motion.q_ddot) + self._viscous * motion.q_dot
+        friction = memory.friction
         if self._coulomb is not None:
             friction = presliding_friction(friction, motion.q_dot * self._dt, self._coulomb)
             torque = torque + friction
-        kept[:, 3 * self._n :] = friction
-        settled = static_deflection(torque, self._K, self._backlash)
-        moving = np.ascontiguousarray(motion.q_dot), np.ascontiguousarray(motion.q_ddot)
-        before = np.ascontiguousarray(memory)
-        lead(self._drives, self._dt, self._K, moving, (torque, settled), (before, kept), offset)
-        return offset, kept
+        target = static_deflection(torque, self._stiffness, self._backlash)
+        deflection = settle(memory.deflection, target, self._stiffness, self._drives, self._dt)
+        rate = (deflection - memory.deflection) / self._dt
+        theta_dot = motion.q_dot + rate
+        theta_ddot = motion.q_ddot + (rate - memory.rate) / self._dt
+        error, windup = servo_error(theta_dot, theta_ddot, torque, memory.windup, self._drives, self._dt)
+        offset = deflection + error - 0.5 * self._dt * theta_dot  # it is held too early
+        return offset, DriveMemory(deflection, rate, windup, friction)
 
-    def deflection(self, offset: Array, memory: Array) -> Array:  # noqa: ARG002  the interface's
-        """See `Compensator`: the offset less what the servo needs."""
-        return memory[..., : self._n]
+    @override
+    def deflection(self, offset: Array, memory: DriveMemory) -> Array:
+        """The offset less what the servo needs, (num_worlds, n) [rad]."""
+        return memory.deflection
 
-    def link_angle(self, theta: Array, memory: Array) -> Array:
-        """See `Compensator`: the deflection of the desired motion, or of the measured wrenches, off the encoder."""
-        if self._measures:
-            return self._static.link_angle(theta, memory)
-        return theta - memory[..., : self._n]
+    @override
+    def link_angle(self, theta: Array, memory: DriveMemory) -> Array:
+        """Link angle by the deflection of the desired motion, or by the measured wrenches, (num_worlds, n) [rad]."""
+        return self._static.link_angle(theta) if self._measures else theta - memory.deflection
 
+    @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """See `Compensator`."""
         return self._static.link_rate(theta, theta_dot)
+
+
+DRIVE = record_type(
+    damping=(),  # D [N·m·s/rad]
+    rotor_inertia=(),  # B [kg·m²]
+    position_gain=(),  # [N·m/rad]
+    velocity_gain=(),  # [N·m·s/rad]
+    integral_gain=(),  # [N·m/(rad·s)]
+)
+"""Rotor, damper and servo of a joint."""
+
+
+@compiled
+def settle(deflection: Array, target: Array, stiffness: Array, drives: Any, period_s: float) -> Array:
+    """Deflections after a control period in which the dampers let them settle, (worlds, n) [rad].
+
+    Args:
+        deflection: Before, (worlds, n) [rad].
+        target: At rest under the joint torque, (worlds, n) [rad].
+        stiffness: K of the worlds, (worlds, n), or of all, (1, n) [N·m/rad].
+        drives: Rows of `DRIVE`, one per joint, (n,).
+        period_s: Control period [s].
+    """
+    settled = np.empty(target.shape)
+    for world in range(len(target)):
+        K = stiffness[min(world, len(stiffness) - 1)]
+        for i in range(len(drives)):
+            settled[world, i] = follow_lag(deflection[world, i], target[world, i], drives[i].damping / K[i], period_s)
+    return settled
+
+
+@compiled
+def servo_error(
+    theta_dot: Array, theta_ddot: Array, torque: Array, windup: Array, drives: Any, period_s: float
+) -> tuple[Array, Array]:
+    """Errors that servos need to move rotors under their loads, [rad], and their integrals after a control period.
+
+    Args:
+        theta_dot: Rates of the motor sides, (worlds, n) [rad/s].
+        theta_ddot: Their accelerations [rad/s²].
+        torque: Joint torques [N·m].
+        windup: Integrals of the errors before [rad·s].
+        drives: Rows of `DRIVE`, one per joint, (n,).
+        period_s: Control period [s].
+    """
+    errors = np.empty(torque.shape)
+    integrals = np.zeros(torque.shape)
+    for world in range(len(torque)):
+        for i in range(len(drives)):
+            drive = drives[i]
+            effort = drive.rotor_inertia * theta_ddot[world, i] + torque[world, i]
+            effort += drive.velocity_gain * theta_dot[world, i]
+            if drive.integral_gain > 0.0:  # k_p e + k_i ∫e = effort
+                time_s = drive.position_gain / drive.integral_gain
+                integrals[world, i] = follow_lag(windup[world, i], effort / drive.integral_gain, time_s, period_s)
+            errors[world, i] = (effort - drive.integral_gain * integrals[world, i]) / drive.position_gain
+    return errors, integrals
+
+
+@compiled
+def follow_lag(state: float, target: float, time_constant_s: float, period_s: float) -> float:
+    """State of a first-order lag after one period towards a constant target; no lag for a time constant of zero."""
+    return target + math.exp(-period_s / time_constant_s) * (state - target)
 
 
 PRESLIDING_RAD = 1e-3
@@ -290,14 +373,14 @@ def presliding_friction(friction: Array, displacement: Array, coulomb: Array) ->
 def _solve(gravity: GravityModel, q: Array, stiffness: Array, torque: Array) -> Array:
     """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg where the legs do not couple, (..., n) [rad]."""
     if isinstance(gravity, LegTorque):
-        return gravity.solved(q, stiffness, torque)
+        return gravity.solve(q, stiffness, torque)
     return solve_stiffness(np.broadcast_to(stiffness, q.shape), gravity.gravity_gradient(q), torque)
 
 
 _T = TypeVar("_T")
 
 
-def alike(compensator: _T) -> _T:
+def shallow_copy(compensator: _T) -> _T:
     """A shallow copy, as `copy.copy` makes it, in a fraction of its time."""
     other = object.__new__(type(compensator))
     other.__dict__.update(compensator.__dict__)

@@ -12,29 +12,34 @@ contact point is, and what of the robot has mass, is chosen by name:
 In single support over its foot, `com` is the exact multibody torque.
 """
 
-from dataclasses import dataclass
-from typing import Any, Literal
+import math
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from baselines.compensation import compensation_kernels as kernels
-from baselines.compensation.observed import ObservedWalk
+from baselines.compensation.policy import WalkView
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
 from elastic_env.dynamics.leg_chains import LegChains
-from elastic_env.dynamics.leg_kernels import solutions
+from elastic_env.dynamics.leg_kernels import gradients, loads_type, solutions, torques
 from elastic_env.joint.elasticity import solve_stiffness
 from elastic_env.runtime.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
 
-_LEGS, _PER_LEG = 2, 6
+_LEGS = 2
+_PER_LEG = 6
 
 
-def gravity_in_pelvis(attitude: Array, gravity: float) -> Array:
-    """Acceleration of gravity in the frame of a pelvis with roll and pitch, (..., 2) [rad] to (..., 3) [m/s²]."""
-    found = np.empty((*attitude.shape[:-1], 3))
-    kernels.gravities(np.ascontiguousarray(attitude).reshape(-1, 2), gravity, found.reshape(-1, 3))
-    return found
+CONTACT = record_type(
+    gravity=(),  # [m/s²]
+    mass=(),  # of the robot [kg]
+    footholds=(2, 2),  # middles of the soles [m]
+    ankle_height=(),  # [m]
+    is_at_zmp=bool,  # or at the ankle axes
+    legs_weigh=bool,
+)
+"""How the ground carries the robot."""
 
 
 class LegTorque:
@@ -42,25 +47,31 @@ class LegTorque:
 
     Args:
         chains: The legs.
-        loads: What loads them, rows as of `LegChains.loads`, (num_worlds,).
+        loads: Loads on them, rows of `LOADS`, (num_worlds,).
     """
 
     def __init__(self, chains: LegChains, loads: Any) -> None:
-        self._chains, self._loads = chains, loads
+        self._chains = chains
+        self._loads = loads
 
     def gravity_torque(self, q: Array) -> Array:
-        """See `GravityModel`."""
-        return self._chains.torque(self._loads, _by_leg(q)).reshape(q.shape)
+        """Torque that holds the legs, (num_worlds, 12) [rad] to [N·m]."""
+        torque = np.empty(q.shape)
+        torques(self._chains.legs, self._loads, _by_leg(q), _by_leg(torque))
+        return torque
 
     def gravity_gradient(self, q: Array) -> Array:
-        """See `GravityModel`; not symmetric under a wrench, which turns with its foot."""
+        """∂τ_g/∂q, (num_worlds, 12, 12) [N·m/rad]; not symmetric under a wrench, which turns with its foot."""
         return _block_diagonal(self.gradient_by_leg(q))
 
     def gradient_by_leg(self, q: Array) -> Array:
         """∂τ_g/∂q of each leg, which does not depend on the other, (num_worlds, 2, 6, 6) [N·m/rad]."""
-        return self._chains.gradient(self._loads, _by_leg(q))
+        legs = _by_leg(q)
+        gradient = np.empty((*legs.shape, _PER_LEG))
+        gradients(self._chains.legs, self._loads, legs, gradient)
+        return gradient
 
-    def solved(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
+    def solve(self, q: Array, stiffness: Array, torque: Array | None = None) -> Array:
         """(K + ∂τ_g/∂q)⁻¹ τ, leg by leg.
 
         Args:
@@ -74,7 +85,9 @@ class LegTorque:
         Raises:
             ElasticError: The matrix is singular.
         """
-        legs, K, x = _by_leg(q), stiffness.reshape(_LEGS, _PER_LEG), np.empty(q.shape)
+        legs = _by_leg(q)
+        K = stiffness.reshape(_LEGS, _PER_LEG)
+        x = np.empty(q.shape)
         given = _OWN if torque is None else _by_leg(torque)
         if not solutions(self._chains.legs, self._loads, legs, K, given, _by_leg(x)):
             torque = self.gravity_torque(q) if torque is None else torque
@@ -84,6 +97,8 @@ class LegTorque:
 
 
 _OWN: Array = np.empty((0, _LEGS, _PER_LEG))
+LOADS = loads_type(_LEGS)
+"""Loads on the legs of a world."""
 
 
 def _by_leg(values: Array) -> Array:
@@ -101,11 +116,15 @@ class ContactGravity:
 
     def __init__(self, model: WalkerModel, method: ContactMethod = "com") -> None:
         biped = model.biped
-        self._observed, self._chains = ObservedWalk(model.observation_table), biped.chains
-        contact = (
-            biped.gravity, biped.chains.mass, biped.footholds, biped.ankle_height, method == "com", method != "lumped",
-        )  # fmt: skip
-        self._contact: Any = np.array([contact], kernels.CONTACT)
+        self._view = WalkView(model.observation_table)
+        self._chains = biped.chains
+        self._contact: Any = np.zeros(1, CONTACT)
+        self._contact["gravity"] = biped.gravity
+        self._contact["mass"] = biped.chains.mass
+        self._contact["footholds"] = biped.footholds
+        self._contact["ankle_height"] = biped.ankle_height
+        self._contact["is_at_zmp"] = method == "com"
+        self._contact["legs_weigh"] = method != "lumped"
 
     def at(self, rows: Array, level: bool = True) -> LegTorque:
         """The gravity torque under the load share of observations, (num_worlds, m).
@@ -118,8 +137,9 @@ class ContactGravity:
 
     def level_and_tilted(self, rows: Array) -> tuple[LegTorque, LegTorque]:
         """The gravity torques of `at` with a level pelvis, and with one that is tilted as the IMU says."""
-        level, tilted = self._chains.loads(len(rows)), self._chains.loads(len(rows))
-        kernels.planned_loads(self._observed.fields(rows), self._contact, level, tilted)
+        level = np.empty(len(rows), LOADS)
+        tilted = np.empty(len(rows), LOADS)
+        planned_loads(self._view.fields(rows), contact=self._contact, level=level, tilted=tilted)
         return LegTorque(self._chains, level), LegTorque(self._chains, tilted)
 
 
@@ -131,13 +151,14 @@ class WrenchTorque:
     """
 
     def __init__(self, model: WalkerModel) -> None:
-        self._observed, self._chains = ObservedWalk(model.observation_table), model.biped.chains_above_feet
+        self._view = WalkView(model.observation_table)
+        self._chains = model.biped.chains_above_feet
         self._gravity = model.biped.gravity
 
     def at(self, rows: Array, level: bool = False) -> LegTorque:
         """The torque under the wrenches of observations, (num_worlds, m); `level` as in `ContactGravity.at`."""
-        loads = self._chains.loads(len(rows))
-        kernels.measured_loads(self._observed.fields(rows), self._gravity, level, loads)
+        loads = np.empty(len(rows), LOADS)
+        measured_loads(self._view.fields(rows), gravity=self._gravity, is_level=level, loads=loads)
         return LegTorque(self._chains, loads)
 
 
@@ -150,7 +171,8 @@ class PlannedTorque:
     """
 
     def __init__(self, model: WalkerModel, gravity: ContactGravity) -> None:
-        self._model, self._gravity = model, gravity
+        self._model = model
+        self._gravity = gravity
         self._time = model.observation_table.group("clock")
         self._reference = model.observation_table.group("reference_angle")
 
@@ -158,12 +180,11 @@ class PlannedTorque:
         """The torque at the control steps of observations, (num_worlds, m); `gravity` is the static one, if known."""
         plan = self._model.plan
         row = np.rint(rows[:, self._time][:, 0] / self._model.control_period_s).astype(np.int64)
-        torque = plan.torque[np.minimum(np.maximum(row, 0), plan.num_steps)]
+        torque = plan.torque.take(row, axis=0, mode="clip")
         return BoundPlannedTorque(torque, rows[:, self._reference], gravity or self._gravity.at(rows))
 
 
-@dataclass(frozen=True)
-class BoundPlannedTorque:
+class BoundPlannedTorque(NamedTuple):
     """Torque of a planned control step; `inverse_dynamics` as that of a `RigidBody`."""
 
     torque: Array
@@ -182,3 +203,124 @@ def _block_diagonal(blocks: Array) -> Array:
     for leg in range(L):
         full[..., leg * J : (leg + 1) * J, leg * J : (leg + 1) * J] = blocks[..., leg, :, :]
     return full
+
+
+@compiled
+def planned_loads(observed: Any, contact: Any, level: Any, tilted: Any) -> None:
+    """Loads under the planned load share.
+
+    Args:
+        observed: Observations, rows with fields.
+        contact: Row of `CONTACT`, (1,).
+        level: Loads of a pelvis that is level, to be filled, rows of `LOADS`.
+        tilted: The same of one that is tilted as the IMU says.
+    """
+    ground = contact[0]
+    for world in range(len(level)):
+        load = level[world]
+        plan = observed[world]
+        fill_gravity(plan, ground.gravity, True, load)
+        load.legs_weigh = ground.legs_weigh
+        share = plan.load_share
+        for foot in range(2):
+            weight = share if foot == 1 else 1.0 - share
+            load.mass[foot] = -ground.mass * weight  # what the ground carries is a negative mass where it does
+            for i in range(2):
+                middle = (1.0 - share) * ground.footholds[0, i] + share * ground.footholds[1, i]
+                load.point[foot, i] = plan.zmp_reference[i] - middle if ground.is_at_zmp else 0.0
+            load.point[foot, 2] = -ground.ankle_height if ground.is_at_zmp else 0.0
+            for i in range(3):
+                load.wrench[foot, 0, i] = load.wrench[foot, 1, i] = 0.0
+        tilted[world] = load
+        fill_gravity(plan, ground.gravity, False, tilted[world])
+
+
+@compiled
+def measured_loads(observed: Any, gravity: float, is_level: bool, loads: Any) -> None:
+    """Loads by the foot wrenches.
+
+    Args:
+        observed: Observations, rows with fields.
+        gravity: Its acceleration [m/s²].
+        is_level: Whether the pelvis is level, or tilted as the IMU says.
+        loads: To be filled, rows of `LOADS`.
+    """
+    for world in range(len(loads)):
+        load = loads[world]
+        shown = observed[world]
+        fill_gravity(shown, gravity, is_level, load)
+        load.legs_weigh = True
+        for foot in range(2):
+            load.mass[foot] = 0.0
+            for i in range(3):
+                load.point[foot, i] = 0.0
+                load.wrench[foot, 0, i] = shown.wrench[foot, 0, i]
+                load.wrench[foot, 1, i] = shown.wrench[foot, 1, i]
+
+
+@compiled
+def fill_gravity(shown: Any, gravity: float, is_level: bool, load: Any) -> None:
+    """Gravity in the frame of a pelvis that is level or tilted."""
+    turned = (0.0, 0.0, -gravity)
+    if not is_level:
+        turned = gravity_in_pelvis(shown.imu_attitude[0], shown.imu_attitude[1], gravity)
+    for i in range(3):
+        load.gravity[i] = turned[i]
+
+
+@compiled
+def gravity_in_pelvis(roll: float, pitch: float, gravity: float) -> tuple[float, float, float]:
+    """Gravity in the frame of a tilted pelvis [m/s²]."""
+    cosine = math.cos(pitch)
+    return gravity * math.sin(pitch), -gravity * (cosine * math.sin(roll)), -gravity * (cosine * math.cos(roll))
+
+
+@compiled
+def shift_plan(observed: Any, shift: Array, spacing: float) -> None:
+    """Shift the plan's ZMP in observations, in place, and its load share with it.
+
+    Args:
+        observed: Observations, rows with fields, (n,).
+        shift: Of the ZMP, x forward and y left, (n, 2) [m].
+        spacing: Distance of the feet [m].
+    """
+    for world in range(len(observed)):
+        shown = observed[world]
+        for i in range(2):
+            shown.zmp_reference[i] += shift[world, i]
+        shown.load_share = shifted_share(shown.load_share, shift[world, 1], spacing)
+
+
+@compiled
+def shifted_shares(observed: Any, planned: Array, period_s: float, shift: Array, spacing: float, found: Array) -> None:
+    """Load shares of the right foot at the end of the last control period, under a ZMP that is shifted.
+
+    Args:
+        observed: Observations, rows with fields, (n,).
+        planned: Shares of the plan, one per control step.
+        period_s: Control period [s].
+        shift: Of the ZMP, x forward and y left, (n, 2) [m].
+        spacing: Distance of the feet [m].
+        found: To be filled, (n,).
+    """
+    for world in range(len(found)):
+        row = int(min(max(np.rint(observed[world].clock[0] / period_s) - 1.0, 0.0), len(planned) - 1.0))
+        found[world] = shifted_share(planned[row], shift[world, 1], spacing)
+
+
+@compiled
+def shifted_share(share: float, shift_y: float, spacing: float) -> float:
+    """Load share of the right foot under a ZMP that is shifted to the left.
+
+    On two feet the feet share the weight by the lever, −p/w of it. Towards single support the foot that stands takes
+    over, whose ankle carries the shift, so that the change fades with 4 μ (1 − μ).
+
+    Args:
+        share: Planned share μ.
+        shift_y: Shift p [m].
+        spacing: Distance w of the feet [m].
+    """
+    shifted = share - 4.0 * share * (1.0 - share) * shift_y / spacing
+    if shifted > 1.0:
+        return 1.0
+    return 0.0 if shifted < 0.0 else shifted

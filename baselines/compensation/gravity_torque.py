@@ -35,15 +35,12 @@ class FixedGravity:
     """Gravity torque of a robot that stands on nothing but its base: the same at every control step."""
 
     def __init__(self, gravity: GravityModel) -> None:
-        self.gravity_torque, self.gravity_gradient = gravity.gravity_torque, gravity.gravity_gradient
+        self.gravity_torque = gravity.gravity_torque
+        self.gravity_gradient = gravity.gravity_gradient
 
     def at(self, rows: Array, level: bool = True) -> "FixedGravity":  # noqa: ARG002  a walker's
         """Itself."""
         return self
-
-    def level_and_tilted(self, rows: Array) -> "tuple[FixedGravity, FixedGravity]":  # noqa: ARG002  a walker's
-        """Itself twice: no pelvis tilts."""
-        return self, self
 
 
 class FixedDynamics:
@@ -87,7 +84,7 @@ def make_gravity(model: RobotModel, method: GravityMethod | None = None) -> Any:
 
 
 def _is_plain_hinge(model: RobotModel) -> bool:
-    """Whether the closed form of one hinge holds."""
+    """True where the closed form of one hinge holds."""
     return len(model.joint_names) == 1 and not needs_more_than_gravity(model.rigid)
 
 
@@ -127,16 +124,18 @@ class HingeTorque:
             raise ConfigurationError(
                 f"gravity method 'hinge' needs one joint, got {len(names)}: {', '.join(names)}; choose tree"
             )
-        body, zero = RigidBody(model.rigid, names), np.zeros(1)
-        self._a, self._b = body.gravity_torque(zero), body.gravity_torque(zero + np.pi / 2)
+        body = RigidBody(model.rigid, names)
+        zero = np.zeros(1)
+        self._a = body.gravity_torque(zero)
+        self._b = body.gravity_torque(zero + np.pi / 2)
         self._inertia = body.inverse_dynamics(zero, zero, np.ones(1)) - self._a
 
     def gravity_torque(self, q: Array) -> Array:
-        """See `GravityModel`."""
+        """τ_g, (..., 1) [rad] to (..., 1) [N·m]."""
         return self._a * np.cos(q) + self._b * np.sin(q)
 
     def gravity_gradient(self, q: Array) -> Array:
-        """See `GravityModel`."""
+        """∂τ_g/∂q, (..., 1) [rad] to (..., 1, 1) [N·m/rad]."""
         return (self._b * np.cos(q) - self._a * np.sin(q))[..., None]
 
     def inverse_dynamics(self, q: Array, q_dot: Array, q_ddot: Array) -> Array:  # noqa: ARG002  as of a `RigidBody`

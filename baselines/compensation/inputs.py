@@ -9,17 +9,18 @@ Columns per joint are in the order of the robot's joints. Axes: x forward, y to 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-from elastic_env.core.signals import Array, Mirrored, Signal
+from elastic_env.core.signals import Mirrored, Signal
 from elastic_env.runtime.robot_model import RobotModel
 
-COMMAND, DEFLECTION = "command", "deflection"
+COMMAND = "command"
+DEFLECTION = "deflection"
 
 
 @dataclass(frozen=True)
 class InputKind:
-    """What is known of an input.
+    """Unit, bounds and columns of an input.
 
     Attributes:
         unit, meaning: In words.
@@ -55,10 +56,13 @@ INPUTS: Mapping[str, InputKind] = {
         "1", "relative change of the posture feedback's gains", default=0.5, limit=1.0, axes={"all": "same"}
     ),
     "balance_gain": InputKind(
-        "1", "relative change of the gains of foot forces and center of mass", default=0.5, limit=1.0,
+        "1",
+        "relative change of the gains of foot forces and center of mass",
+        default=0.5,
+        limit=1.0,
         axes={"all": "same"},
     ),
-}  # fmt: skip
+}
 """All inputs by name. Every policy has `command`; a policy's `inputs` names the others that it has."""
 
 
@@ -72,45 +76,6 @@ def input_signals(name: str, model: RobotModel) -> tuple[Signal, ...]:
         signs = [signal.mirrored for signal in model.observation_table.signals_of("last_command")]
     named = zip(model.joint_names, signs, strict=True)
     return tuple(Signal(f"{name}.{joint}", kind.unit, kind.meaning, mirrored=sign) for joint, sign in named)
-
-
-class PolicyInputs(NamedTuple):
-    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is not used.
-
-    A wrapper takes what is its own and passes on the rest. `INPUTS` says what each is. `command` is no field: it is
-    added to whatever a policy commands.
-    """
-
-    deflection: Array | None = None
-    zmp: Array | None = None
-    com: Array | None = None
-    leg_length: Array | None = None
-    hip: Array | None = None
-    posture_gain: Array | None = None
-    balance_gain: Array | None = None
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no input is used."""
-        return self is NO_INPUTS or all(value is None for value in self)
-
-    def with_deflection(self, correction: Array | None) -> "PolicyInputs":
-        """The same with another relative change of the deflection."""
-        return self if correction is self.deflection else self._replace(deflection=correction)
-
-    @property
-    def zmp_shift(self) -> Array | None:
-        """Where the plan has its ZMP now, less where it had it, (num_worlds, 2) [m]; None where that is not used.
-
-        A center of mass that is shifted for long takes the ZMP along.
-        """
-        if self.zmp is None or self.com is None:
-            return self.com if self.zmp is None else self.zmp
-        return self.zmp + self.com
-
-
-NO_INPUTS = PolicyInputs()
-"""What a policy gets that nothing acts on."""
 
 
 def inputs_of(policy: Any) -> tuple[str, ...]:

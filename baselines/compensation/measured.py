@@ -10,14 +10,19 @@ closed chain, and δ follows the command by as much as the command changes. The 
 instead, which `baselines.adaptation` corrects slowly by what is measured.
 """
 
-import numpy as np
+from typing import Any
 
-from baselines.compensation.compensators import Compensator, Motion, alike
+import numpy as np
+from typing_extensions import override
+
+from baselines.compensation.compensators import Compensator, shallow_copy
+from baselines.compensation.policy import Motion
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 from elastic_env.runtime.robot_model import RobotModel
 
-TORQUE_SENSOR, LINK_ENCODER = "joint_torque", "link_encoder"
+TORQUE_SENSOR = "joint_torque"
+LINK_ENCODER = "link_encoder"
 
 
 def require_sensor(table: SignalTable, sensor: str, group: str | None = None) -> None:
@@ -56,8 +61,10 @@ class DeflectionSensors:
     def __init__(self, model: RobotModel, sensor: str, joints: tuple[str, ...] = ("",)) -> None:
         table = model.observation_table
         require_sensor(table, sensor)
-        self._stiffness, self._is_torque = model.stiffness, sensor == TORQUE_SENSOR
-        self._columns, self._encoder = table.group(sensor), table.group("encoder_angle")
+        self._stiffness = model.stiffness
+        self._is_torque = sensor == TORQUE_SENSOR
+        self._columns = table.group(sensor)
+        self._encoder = table.group("encoder_angle")
         self.has: BoolArray = np.array([any(part in name for part in joints) for name in model.joint_names])
         self.modelled: Array = np.where(self.has & (sensor == LINK_ENCODER), 0.0, 1.0)
 
@@ -67,8 +74,8 @@ class DeflectionSensors:
         return self.has * (shown / self._stiffness if self._is_torque else rows[:, self._encoder] - shown)
 
 
-class MeasuredCompensator:
-    """A compensator whose links are those of sensors where there are any; a `Compensator`.
+class MeasuredCompensator(Compensator):
+    """A compensator whose links are those of sensors where there are any.
 
     Args:
         base: Compensator for the command, and for the links of joints without a sensor.
@@ -76,35 +83,40 @@ class MeasuredCompensator:
     """
 
     def __init__(self, base: Compensator, sensors: DeflectionSensors) -> None:
-        self._base, self._sensors = base, sensors
-        self.model, self.memory_width, self.modelled = base.model, base.memory_width, sensors.modelled
+        self.model = base.model
+        self._base = base
+        self._sensors = sensors
+        self.modelled = sensors.modelled
+        self._measures_all = bool(sensors.has.all())
         self._deflection: Array = np.zeros(len(base.model.joint_names))
 
+    @override
     def at(self, rows: Array) -> "MeasuredCompensator":
-        """See `Compensator`."""
-        bound = alike(self)
-        bound._base, bound._deflection = self._base.at(rows), self._sensors.deflection(rows)
+        bound = shallow_copy(self)
+        bound._base = self._base.at(rows)
+        bound._deflection = self._sensors.deflection(rows)
         return bound
 
-    def begin(self, motion: Motion) -> Array:
-        """See `Compensator`."""
+    @override
+    def begin(self, motion: Motion) -> Any:
         return self._base.begin(motion)
 
-    def offset(self, motion: Motion, memory: Array) -> tuple[Array, Array]:
-        """See `Compensator`."""
+    @override
+    def offset(self, motion: Motion, memory: Any) -> tuple[Array, Any]:
         return self._base.offset(motion, memory)
 
-    def deflection(self, offset: Array, memory: Array) -> Array:
-        """See `Compensator`."""
+    @override
+    def deflection(self, offset: Array, memory: Any) -> Array:
         return self._base.deflection(offset, memory)
 
-    def link_angle(self, theta: Array, memory: Array) -> Array:
-        """See `Compensator`."""
+    @override
+    def link_angle(self, theta: Array, memory: Any) -> Array:
         measured = theta - self._deflection
-        if self._sensors.has.all():
+        if self._measures_all:
             return measured
         return np.where(self._sensors.has, measured, self._base.link_angle(theta, memory))
 
+    @override
     def link_rate(self, theta: Array, theta_dot: Array) -> Array:
-        """See `Compensator`: that of the model."""
+        """The rate by the model, (num_worlds, n) [rad/s]."""
         return self._base.link_rate(theta, theta_dot)

@@ -1,19 +1,38 @@
 """The upper bound: a policy that reads the truth."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.compensators import DynamicCompensator
-from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
+from baselines.compensation.compensators import DriveMemory, DynamicCompensator
+from baselines.compensation.policy import Motion, Policy, PolicyAround, PolicyInputs
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S
 
 
-class Oracle:
-    """What perfect sensing and a perfect model give: the only policy that may read the truth.
+class OracleMemory(NamedTuple):
+    """Memory of the oracle.
+
+    Attributes:
+        steps: Control steps since the start of the episode, (num_worlds, 1).
+        correction: Of the integrator, (num_worlds, n) [rad].
+        target: Reference of the last control step, (num_worlds, n) [rad].
+        compensator: Memory of the compensator.
+        inner: Memory of the policy.
+    """
+
+    steps: IntArray
+    correction: Array
+    target: Array
+    compensator: DriveMemory
+    inner: Any
+
+
+class Oracle(PolicyAround):
+    """Perfect sensing and a perfect model: the only policy that may read the truth.
 
     The dynamic compensator with the true parameters around a policy that sees the true link angles; on the testbed also
     an integrator on the true link error for what is left, with a gain below the damping of the link's resonance.
@@ -37,45 +56,57 @@ class Oracle:
         friction: bool = True,
         integral_gain: float = 1.0,
     ) -> None:
-        self.policy, self.integral_gain = policy, integral_gain
         self._env = env.unwrapped
         model = self._env.truth().model
-        self._view = ObservationView(self._env.task.observation_table, model.control_period_s)
+        super().__init__(policy, self._env.task.observation_table, model.control_period_s)
+        self.integral_gain = integral_gain
         self._compensator = DynamicCompensator(model, friction=friction)
         self._dt = model.control_period_s
         self._ramp = Ramp(model, ramp_s)
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Action and new state; the observation must be the environment's present one."""
-        rows = self._view.rows(observation)
+    @property
+    @override
+    def inputs(self) -> tuple[str, ...]:
+        return ()
+
+    @override
+    def begin(self, rows: Array) -> OracleMemory:
+        self._require_present(rows)
+        motion = self.view.motion(rows)
+        stiffness = self._env.truth().stiffness
+        return OracleMemory(
+            steps=np.zeros((len(rows), 1), dtype=np.int64),
+            correction=np.zeros_like(motion.q),
+            target=motion.q.copy(),
+            compensator=self._compensator.at(rows).with_stiffness(stiffness).begin(motion),
+            inner=self.policy.begin(rows),
+        )
+
+    @override
+    def act(self, rows: Array, memory: OracleMemory, inputs: PolicyInputs) -> tuple[Array, OracleMemory]:
+        """The observation must be the environment's present one."""
+        self._require_present(rows)
+        truth = self._env.truth()
+        motion = self.view.motion(rows)
+        wanted, inner = self.policy.act(self.view.with_links(rows, truth.q, truth.q_dot), memory.inner, inputs)
+        error = np.where(self._ramp.is_over(memory.steps), memory.target - truth.q, 0.0)
+        correction = memory.correction + self.integral_gain * self._dt * error
+        correction = np.clip(correction, -self.integral_limit, self.integral_limit)
+        compensator = self._compensator.at(rows).with_stiffness(truth.stiffness)
+        desired = Motion(motion.q + wanted, motion.q_dot, motion.q_ddot)
+        offset, own = compensator.offset(desired, memory.compensator)
+        steps = memory.steps + 1
+        action = wanted + self._ramp.table.take(steps, mode="clip") * offset + correction
+        return action.astype(np.float32), OracleMemory(steps, correction, motion.q.copy(), own, inner)
+
+    @override
+    def link_angles(self, rows: Array, memory: Any) -> Array:
+        """The true link angles, (num_worlds, n) [rad]."""
+        return self._env.truth().q
+
+    def _require_present(self, rows: Array) -> None:
         if not np.array_equal(rows, np.atleast_2d(self._env.task.observe())):
             raise ElasticError(
                 "the oracle reads the truth of the environment that it was made for, and this is not its present "
                 'observation; make one with baselines.make("oracle", env) for the environment that it is to run in'
             )
-        truth, motion = self._env.truth(), self._view.motion(rows)
-        n = motion.q.shape[-1]
-        compensator = self._compensator.at(rows).with_stiffness(truth.stiffness)
-        memory, inner = taken_up(
-            state, episode_start, rows, self._view,
-            lambda: np.hstack([np.zeros((len(rows), 1 + n)), motion.q, compensator.begin(motion)]),
-        )  # fmt: skip
-        seen = self._view.with_links(rows, truth.q, truth.q_dot)
-        wanted, inner = self.policy.predict(seen, inner, episode_start, deterministic)
-        wanted = np.asarray(wanted, dtype=np.float64)
-        steps, correction, target, kept = np.split(memory, [1, 1 + n, 1 + 2 * n], axis=1)
-        steps = steps + 1.0
-        error = np.where(self._ramp.is_over(steps - 1.0), target - truth.q, 0.0)
-        correction = np.clip(
-            correction + self.integral_gain * self._dt * error, -self.integral_limit, self.integral_limit
-        )
-        offset, kept = compensator.offset(motion.shifted(wanted), kept)
-        action = (wanted + self._ramp.after(steps) * offset + correction).astype(np.float32)
-        new_state = np.hstack([steps, correction, motion.q, kept]), inner
-        return action.reshape((*observation.shape[:-1], n)), new_state
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002  the interface's
-        """The true link angle, (..., n) [rad]."""
-        return self._env.truth().q.reshape((*observation.shape[:-1], -1))

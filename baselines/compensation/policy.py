@@ -1,22 +1,27 @@
-"""What a policy is, and what policies share: the columns of an observation, and memory from call to call.
+"""Policies: what one is, the base class of ours, and what they share.
 
 Policies take observations of one world, (m,), or of many, (num_worlds, m). Those with memory keep it in `state`, one
 row per world: pass the returned state back, and `episode_start` where episodes begin, as Stable-Baselines3 does.
+
+A policy of ours computes rows: `BatchPolicy.predict` makes them once for a whole chain of policies, and each says how
+its memory begins and how it acts. Memory is a named tuple of arrays with one row per world; the memory of the policy
+inside it is one of its fields.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
-from baselines.compensation.compensators import Motion
-from baselines.compensation.inputs import NO_INPUTS, PolicyInputs, inputs_of
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
 
 Action = npt.NDArray[np.float32]
+Records: TypeAlias = npt.NDArray[Any]
+"""An array of a structured type, one row per world."""
 
 
 class Policy(Protocol):
@@ -29,44 +34,89 @@ class Policy(Protocol):
         ...
 
 
-class PolicyWithInputs(ABC):
-    """A policy in whose own quantities something outside can act, see `baselines.compensation.inputs`."""
+class PolicyInputs(NamedTuple):
+    """Values of the inputs that a policy is given, (num_worlds, columns) each; None for one that is not used.
+
+    A policy takes what is its own and passes on the rest. `baselines.compensation.inputs` says what each input is.
+    `command` is no field: it is added to whatever a policy commands. The last two fields tell a policy of a user how
+    `predict` was called.
+    """
+
+    deflection: Array | None = None
+    zmp: Array | None = None
+    com: Array | None = None
+    leg_length: Array | None = None
+    hip: Array | None = None
+    posture_gain: Array | None = None
+    balance_gain: Array | None = None
+    is_single: bool = False
+    deterministic: bool = True
 
     @property
-    @abstractmethod
+    def zmp_shift(self) -> Array | None:
+        """Shift of the planned ZMP, (num_worlds, 2) [m]; None where that is not used.
+
+        A center of mass that is shifted for long takes the ZMP along.
+        """
+        if self.zmp is None or self.com is None:
+            return self.com if self.zmp is None else self.zmp
+        return self.zmp + self.com
+
+
+NO_INPUTS = PolicyInputs()
+ONE_WORLD = PolicyInputs(is_single=True)
+"""Inputs of a policy that nothing acts on, in many worlds and in one."""
+
+
+class BatchPolicy(ABC):
+    """A policy that commands a batch of worlds at once.
+
+    Args:
+        table: Of the observations.
+        control_period_s: Time between two observations [s].
+    """
+
+    reads_rates = True
+    """It reads the rates of the joints; if not, a compensator around it does not estimate them."""
+
+    def __init__(self, table: SignalTable, control_period_s: float) -> None:
+        self.view = ObservationView(table, control_period_s)
+
+    @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs that it has beside `command`: its own, and those of the policies inside it."""
+        return ()
 
     def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        self,
+        observation: Array,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+        inputs: PolicyInputs = NO_INPUTS,
     ) -> tuple[Action, Any]:
         """Action and new state.
+
+        Args:
+            observation: Of one world, (m,), or of many, (num_worlds, m).
+            state: What the last call returned; None at the start of an episode.
+            episode_start: Worlds whose episode begins; None for those of the last call going on.
+            deterministic: Handed on to a policy of a user inside it.
+            inputs: Values of its inputs; zeros are as if there were none, to the last bit.
 
         Raises:
             ElasticError: Called in the middle of an episode without the state of the last call.
         """
-        return self.predict_with(observation, NO_INPUTS, state, episode_start, deterministic)
+        rows = self.view.rows(observation)
+        memory = resume_memory(self, rows, state, episode_start)
+        is_single = np.ndim(observation) == 1
+        if inputs is NO_INPUTS and deterministic:
+            inputs = ONE_WORLD if is_single else NO_INPUTS
+        else:
+            inputs = inputs._replace(is_single=is_single, deterministic=deterministic)
+        action, memory = self.act(rows, memory, inputs)
+        return as_action(action, is_single), memory
 
-    @abstractmethod
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Action, Any]:
-        """`predict` under inputs: a policy takes what is its own and passes on the rest.
-
-        Args:
-            observation: As in `predict`.
-            inputs: Their values; zeros are as if there were none, to the last bit.
-            state: As in `predict`.
-            episode_start: As in `predict`.
-            deterministic: As in `predict`.
-        """
-
-    @abstractmethod
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Link angles that the policy saw in the place of an observation's encoders, (..., n) [rad].
 
@@ -74,67 +124,209 @@ class PolicyWithInputs(ABC):
             observation: As in `predict`.
             state: What `predict` returned for it.
         """
+        angles = self.link_angles(self.view.rows(observation), state)
+        return angles.reshape((*np.shape(observation)[:-1], angles.shape[-1]))
+
+    @abstractmethod
+    def begin(self, rows: Array) -> Any:
+        """Memory at the start of an episode, None for a policy without.
+
+        Args:
+            rows: First observations of the episodes, (num_worlds, m).
+        """
+
+    @abstractmethod
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> tuple[Array, Any]:
+        """Offsets of the joints, (num_worlds, n) in single precision [rad], and the new memory.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            memory: That of the last control step; it is not changed.
+            inputs: Values of its inputs.
+        """
+
+    def link_angles(self, rows: Array, memory: Any) -> Array:  # noqa: ARG002  for those that estimate
+        """`link_estimate` of rows, (num_worlds, n) [rad]: the encoder angles of a policy that estimates nothing."""
+        return self.view.theta(rows)
 
 
-class PolicyAround(PolicyWithInputs):
-    """A policy around another one, whose state is the second part of its own."""
-
-    _policy: Any
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Those of the policy inside it."""
-        return inputs_of(self._policy)[1:]
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy inside it saw, (..., n) [rad]."""
-        return self._policy.link_estimate(observation, state[1])
-
-
-def predicted(policy: Any, observation: Array, inputs: PolicyInputs, *call: Any) -> tuple[Any, Any]:
-    """Action and new state of a policy under inputs; one that gets none need not know of any.
+class PolicyAround(BatchPolicy):
+    """A policy around another one, whose memory is the field `inner` of its own.
 
     Args:
         policy: Any policy.
-        observation: As in `predict`.
-        inputs: What is left for it.
-        *call: state, episode_start and deterministic as in `predict`.
+        table: Of the observations.
+        control_period_s: Time between two observations [s].
     """
-    if inputs.is_empty:
-        return policy.predict(observation, *call)
-    return policy.predict_with(observation, inputs, *call)
+
+    def __init__(self, policy: Any, table: SignalTable, control_period_s: float) -> None:
+        super().__init__(table, control_period_s)
+        self.policy = as_batch_policy(policy, table, control_period_s)
+
+    @property
+    @override
+    def inputs(self) -> tuple[str, ...]:
+        return self.policy.inputs
+
+    @override
+    def link_angles(self, rows: Array, memory: Any) -> Array:
+        return self.policy.link_angles(rows, memory.inner)
 
 
-class Zero:
+class Zero(BatchPolicy):
     """Plays the reference back: no offset, no memory, and it takes the encoder for the link."""
 
-    def __init__(self, table: SignalTable) -> None:
-        self._encoder = table.group("encoder_angle")
+    reads_rates = False
 
+    def __init__(self, table: SignalTable) -> None:
+        super().__init__(table, 0.0)  # without memory it does not ask where episodes begin
+
+    @override
     def predict(
         self,
         observation: Array,
         state: Any = None,
-        episode_start: Any = None,  # noqa: ARG002  the interface's
-        deterministic: bool = True,  # noqa: ARG002
+        episode_start: Any = None,
+        deterministic: bool = True,
+        inputs: PolicyInputs = NO_INPUTS,
     ) -> tuple[Action, Any]:
-        """Zero offset, (..., n)."""
-        return np.zeros(observation[..., self._encoder].shape, dtype=np.float32), state
+        """Zero offset, (..., n) [rad]: it reads nothing of an observation, so it asks nothing of it."""
+        return np.zeros((*observation.shape[:-1], self.view.num_joints), dtype=np.float32), None
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
-        """The encoder angle, (..., n) [rad]."""
-        return observation[..., self._encoder]
+    @override
+    def begin(self, rows: Array) -> None:
+        return None
+
+    @override
+    def act(self, rows: Array, memory: None, inputs: PolicyInputs) -> tuple[Array, None]:
+        return np.zeros((len(rows), self.view.num_joints), dtype=np.float32), None
+
+
+class UserMemory(NamedTuple):
+    """Memory of a policy of a user.
+
+    Attributes:
+        has_begun: Worlds whose episode has begun before, (num_worlds,).
+        state: Its state in a list of one. The policy itself begins it afresh, where we tell it that an episode starts.
+    """
+
+    has_begun: BoolArray
+    state: list[Any]
+
+
+class UserPolicy(BatchPolicy):
+    """A policy of a user as one of ours: it gets observations of the shape that the caller gave."""
+
+    def __init__(self, policy: Any, table: SignalTable, control_period_s: float) -> None:
+        super().__init__(table, control_period_s)
+        self._policy = policy
+        self.reads_rates = getattr(policy, "reads_rates", True)
+
+    @override
+    def begin(self, rows: Array) -> UserMemory:
+        return UserMemory(np.zeros(len(rows), dtype=np.bool_), [None])
+
+    @override
+    def act(self, rows: Array, memory: UserMemory, inputs: PolicyInputs) -> tuple[Array, UserMemory]:
+        action, state = self._policy.predict(
+            rows[0] if inputs.is_single else rows, memory.state[0], ~memory.has_begun, inputs.deterministic
+        )
+        offset = np.atleast_2d(np.asarray(action, dtype=np.float64))
+        return offset, UserMemory(np.ones(len(rows), dtype=np.bool_), [state])
+
+    @override
+    def link_angles(self, rows: Array, memory: UserMemory) -> Array:
+        return self._policy.link_estimate(rows, memory.state[0])
+
+
+def as_batch_policy(policy: Any, table: SignalTable, control_period_s: float) -> BatchPolicy:
+    """The policy itself if it is one of ours, else one around it."""
+    return policy if isinstance(policy, BatchPolicy) else UserPolicy(policy, table, control_period_s)
+
+
+def as_action(offsets: Array, is_single: bool) -> Action:
+    """Rows of offsets in single precision, or the only row for an observation of one world."""
+    return (offsets[0] if is_single else offsets).astype(np.float32, copy=False)
+
+
+def resume_memory(policy: Any, rows: Array, state: Any, episode_start: Any) -> Any:
+    """Memory for this call: that of the last one, with the rows of new episodes begun afresh.
+
+    Args:
+        policy: Begins memory.
+        rows: Observations, (num_worlds, m).
+        state: What the last call returned, or None.
+        episode_start: Worlds whose episode begins; None for none where there is a state.
+
+    Raises:
+        ElasticError: No state in the middle of an episode, or one of another number of worlds.
+    """
+    if state is None:
+        memory = policy.begin(rows)
+        if memory is not None:
+            policy.view.require_start(rows, episode_start)
+        return memory
+    if (number := count_rows(state)) != len(rows):
+        raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {number}")
+    if episode_start is None or episode_start is False or np.count_nonzero(episode_start) == 0:
+        return state
+    fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
+    return put_rows(state, fresh, select_rows(policy.begin(rows), fresh))
+
+
+def count_rows(memory: Any) -> int:
+    """Number of worlds of a memory, by its first array."""
+    while not isinstance(memory, np.ndarray):
+        memory = memory[0]
+    return len(memory)
+
+
+def put_rows(memory: Any, worlds: BoolArray, rows: Any) -> Any:
+    """Memory with other rows in some worlds, a (num_worlds,) mask; what is neither array nor tuple stays."""
+    if isinstance(memory, np.ndarray):
+        changed = memory.copy()
+        changed[worlds] = rows
+        return changed
+    if isinstance(memory, tuple):
+        return _like(memory, [put_rows(part, worlds, other) for part, other in zip(memory, rows, strict=True)])
+    return memory
+
+
+def select_rows(memory: Any, worlds: BoolArray) -> Any:
+    """Memory of some worlds, a (num_worlds,) mask."""
+    if isinstance(memory, np.ndarray):
+        return memory[worlds]
+    if isinstance(memory, tuple):
+        return _like(memory, [select_rows(part, worlds) for part in memory])
+    return memory
+
+
+def _like(memory: tuple[Any, ...], parts: list[Any]) -> tuple[Any, ...]:
+    return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
+
+
+class Motion(NamedTuple):
+    """Desired motion of the links, (..., n) each [rad], [rad/s], [rad/s²]."""
+
+    q: Array
+    q_dot: Array
+    q_ddot: Array
 
 
 class ObservationView:
-    """Where an observation table holds what compensators need, by name."""
+    """Columns of an observation that compensators need, by name."""
 
     def __init__(self, table: SignalTable, control_period_s: float) -> None:
-        self._width, self._period_s = len(table), control_period_s
+        self._width = len(table)
+        self._period_s = control_period_s
         self._clock = table.group("clock") if "clock.time" in table.names else None
-        self._theta, self._theta_dot = table.group("encoder_angle"), table.group("encoder_rate")
-        self._q, self._q_dot = table.group("reference_angle"), table.group("reference_rate")
-        self._q_ddot, self._command = table.group("reference_acceleration"), table.group("last_command")
+        self._theta = table.group("encoder_angle")
+        self._theta_dot = table.group("encoder_rate")
+        self._q = table.group("reference_angle")
+        self._q_dot = table.group("reference_rate")
+        self._q_ddot = table.group("reference_acceleration")
+        self._command = table.group("last_command")
+        self.num_joints = self._theta.stop - self._theta.start
 
     def theta(self, rows: Array) -> Array:
         """Encoder angles, (num_worlds, n) [rad]."""
@@ -148,10 +340,12 @@ class ObservationView:
         """Reference motion for the coming control period, (num_worlds, n) each."""
         return Motion(rows[:, self._q], rows[:, self._q_dot], rows[:, self._q_ddot])
 
-    def with_links(self, rows: Array, q: Array, q_dot: Array) -> Array:
-        """A copy of the observation with link angles and rates in place of the encoders'."""
+    def with_links(self, rows: Array, q: Array, q_dot: Array | None) -> Array:
+        """A copy of the observation with link angles in place of the encoders', and rates if they are given."""
         seen = rows.copy()
-        seen[:, self._theta], seen[:, self._theta_dot] = q, q_dot
+        seen[:, self._theta] = q
+        if q_dot is not None:
+            seen[:, self._theta_dot] = q_dot
         return seen
 
     def rows(self, observation: Array) -> Array:
@@ -169,8 +363,27 @@ class ObservationView:
             )
         return rows
 
+    def require_start(self, rows: Array, episode_start: Any) -> None:
+        """Refuse observations that are not the first of their episodes.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            episode_start: Worlds whose episode begins; None to tell it by the observations.
+
+        Raises:
+            ElasticError: An episode goes on.
+        """
+        starts = self.is_start(rows) if episode_start is None else np.asarray(episode_start)
+        if not np.all(starts):
+            sign = "clock.time" if self._clock is not None else "a reference at rest, and no command yet"
+            raise ElasticError(
+                "predict() was called without `state` in what looks like the middle of an episode (a beginning is "
+                f"known by {sign}): this policy has memory; pass the state that the last call returned, "
+                "and episode_start=True where an episode begins"
+            )
+
     def is_start(self, rows: Array) -> BoolArray:
-        """Whether an observation can be the first of an episode: by its clock, or standing with nothing commanded.
+        """True for an observation that can be the first of an episode: by its clock, or at rest without a command.
 
         Nothing is commanded where the last command is the reference, or zero, as an environment may begin with.
         """
@@ -180,29 +393,41 @@ class ObservationView:
         nothing = (command == rows[:, self._q]).all(axis=1) | (command == 0.0).all(axis=1)
         return (rows[:, self._q_dot] == 0.0).all(axis=1) & nothing
 
-    @property
-    def sign_of_start(self) -> str:
-        """By what `is_start` knows it, in words."""
-        return "clock.time" if self._clock is not None else "a reference at rest, and no command yet"
+
+_GROUPS: Mapping[str, tuple[int, ...]] = {
+    "encoder_angle": (12,),
+    "encoder_rate": (12,),
+    "imu_attitude": (2,),
+    "imu_rate": (3,),
+    "wrench": (2, 2, 3),
+    "reference_angle": (12,),
+    "reference_rate": (12,),
+    "clock": (3,),
+    "load_share": (),
+    "zmp_reference": (2,),
+}
+"""Groups of a walker's observation, and the shapes of their fields; wrench: feet, force and moment, axes."""
 
 
-def taken_up(
-    state: Any, episode_start: Any, rows: Array, view: ObservationView, begin: Callable[[], Array]
-) -> tuple[Array, Any]:
-    """Memory and inner state for this call, with the rows of new episodes begun afresh."""
-    if state is None:
-        starts = view.is_start(rows) if episode_start is None else np.broadcast_to(episode_start, (len(rows),))
-        if not np.all(starts):
-            raise ElasticError(
-                "predict() was called without `state` in what looks like the middle of an episode (a beginning is "
-                f"known by {view.sign_of_start}): this policy has memory; pass the state that the last call returned, "
-                "and episode_start=True where an episode begins"
-            )
-        return begin(), None
-    memory, inner_state = state
-    if len(memory) != len(rows):
-        raise ElasticError(f"`state` must have one row per world, {len(rows)}, got {len(memory)}")
-    if episode_start is not None and episode_start is not False and np.count_nonzero(episode_start) > 0:
-        fresh = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), (len(rows),))
-        memory = np.where(fresh[:, None], begin(), memory)
-    return memory, inner_state
+class WalkView:
+    """Observations of a walker as rows with named fields, as compiled kernels read them.
+
+    Args:
+        table: Of the observation.
+    """
+
+    def __init__(self, table: SignalTable) -> None:
+        groups = [table.group(name) for name in _GROUPS]
+        layout = {
+            "names": list(_GROUPS),
+            "formats": [(np.float64, shape) for shape in _GROUPS.values()],
+            "offsets": [8 * group.start for group in groups],
+            # without the sensors behind them, so that one kernel fits all walkers
+            "itemsize": 8 * max(group.stop for group in groups),
+        }
+        self._type = np.dtype((np.record, layout))
+
+    def fields(self, rows: Array) -> Records:
+        """Observations, (num_worlds, m), as rows with fields, (num_worlds,), in the same memory."""
+        rows = np.ascontiguousarray(rows)
+        return np.ndarray(len(rows), self._type, rows, 0, rows.strides[:1])

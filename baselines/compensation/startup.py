@@ -10,7 +10,7 @@ Control 112(1).
 
 import numpy as np
 
-from elastic_env.core.signals import Array, BoolArray
+from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.sway import sway_frequencies
 from elastic_env.motion.trajectory import minimum_jerk
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
@@ -40,17 +40,14 @@ class Ramp:
         steps = np.arange(np.ceil(self._duration / self._period_s) + 2.0)
         self.table = self.share(steps[: int(np.argmax(self.is_over(steps))) + 1])
 
-    def after(self, steps: Array) -> Array:
-        """Share after a whole number of control steps, elementwise: `share`, looked up."""
-        return self.table.take(steps.astype(np.intp), mode="clip")
-
     def share(self, steps: Array) -> Array:
         """Share after a number of control steps, elementwise."""
-        time, each = steps * self._period_s, self._duration - self._delay
+        time = steps * self._period_s
+        each = self._duration - self._delay
         return 0.5 * (minimum_jerk(time / each) + minimum_jerk((time - self._delay) / each))
 
-    def is_over(self, steps: Array) -> BoolArray:
-        """Whether the compensation is complete."""
+    def is_over(self, steps: Array | IntArray) -> BoolArray:
+        """True where the compensation is complete."""
         return steps * self._period_s >= self._duration
 
 

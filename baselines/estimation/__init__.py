@@ -1,1 +1,1 @@
-"""What measurements say of the joints and of the ground."""
+"""Estimates of the joints and of the ground from measurements."""

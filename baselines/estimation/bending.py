@@ -13,32 +13,40 @@ squares over the time that a foot is loaded tell ρ from c, for roll and pitch o
 [Kalman1960] R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", J. Basic Eng. 82.
 """
 
+import math
+from typing import Any
+
 import numpy as np
 
 from baselines.compensation.compensators import GravityCompensator
-from baselines.compensation.observed import ObservedWalk
-from baselines.estimation.estimation_kernels import ESTIMATE, regress
+from baselines.compensation.policy import Records, WalkView
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array, Signal
 from elastic_env.dynamics.leg_kernels import sole_tilts
 from elastic_env.runtime.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
 """Share of the weight from which an estimate takes a foot for loaded, and flat on the ground."""
-MODEL_ERROR, OFFSET_RAD, DISAGREEMENT_RAD = 0.3, 0.02, 0.002
+MODEL_ERROR = 0.3
+OFFSET_RAD = 0.02
+DISAGREEMENT_RAD = 0.002
 """Standard deviations before the first measurement, of ρ and c, and of a measurement."""
 
 _UNKNOWNS = 2  # ρ and c
 _SHAPE = (2, 2)  # legs, roll and pitch
 _FILTERS = tuple(f".{side}_{axis}" for side in "lr" for axis in ("roll", "pitch"))
-_VARIANCES = 12  # per world: (legs, axes, upper triangle)
-_PRIOR: Array = np.tile(np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2, 4)
-"""The variances before the first measurement."""
+_PRIOR: Array = np.diag([MODEL_ERROR, OFFSET_RAD])[np.triu_indices(_UNKNOWNS)] ** 2
+"""Upper triangle of the covariance before the first measurement."""
+
+ESTIMATE = record_type(
+    unknowns=(2, 2, 2),  # legs, roll and pitch: ρ [1] and c [rad]
+    covariance=(2, 2, 3),  # its upper triangle
+)
+"""Estimates of a robot's legs."""
 
 
 class BendingObserver:
-    """Estimates of the model's error, from the observations of a walker.
-
-    Memory per world: estimates of ρ and c, and their covariance.
+    """Estimates of the model's error, from the observations of a walker; its memory is rows of `ESTIMATE`.
 
     Args:
         model: Assumed walker.
@@ -53,41 +61,50 @@ class BendingObserver:
         )
         for filtered in filters
     )
-    """What `observe` returns."""
-    memory_width = ESTIMATE.itemsize // 8
+    """Values of `observe`."""
 
     def __init__(self, model: WalkerModel) -> None:
-        self._model, self._compensator = model, GravityCompensator(model, output="wrench")
+        self._model = model
+        self._compensator = GravityCompensator(model, output="wrench")
         table = model.observation_table
-        self._theta, self._attitude = table.group("encoder_angle"), table.group("imu_attitude")
-        self._observed = ObservedWalk(table)
+        self._theta = table.group("encoder_angle")
+        self._attitude = table.group("imu_attitude")
+        self._view = WalkView(table)
         self._carried = model.biped.chains_above_feet.mass * model.biped.gravity
 
-    def begin(self, num_worlds: int) -> Array:
-        """Memory before the first measurement, (num_worlds, memory_width)."""
-        memory = np.zeros((num_worlds, self.memory_width))
-        memory[:, -_VARIANCES:] = _PRIOR
+    def begin(self, num_worlds: int) -> Records:
+        """Memory before the first measurement, (num_worlds,)."""
+        memory = np.zeros(num_worlds, ESTIMATE)
+        memory["covariance"] = _PRIOR
         return memory
 
-    def observe(self, rows: Array, memory: Array, bending: Array | None = None) -> tuple[Array, Array]:
+    def observe(self, rows: Array, memory: Records, bending: Array | None = None) -> tuple[Array, Records]:
         """Estimates after a measurement, see `signals`, and the new memory.
 
         Args:
             rows: Observations, (num_worlds, m).
-            memory: (num_worlds, memory_width).
+            memory: (num_worlds,).
             bending: Of the joints as the model has it, (num_worlds, 12) [rad]; None for that under the foot wrenches.
         """
         seen, expected = self.disagreement(rows, self.bending(rows) if bending is None else bending)
-        kept, found = np.empty(memory.shape), np.empty((len(rows), len(self.signals)))
-        before, now = (np.ndarray(len(rows), ESTIMATE, np.ascontiguousarray(part)) for part in (memory, kept))
-        least = self._carried, LOADED_SHARE * self._carried, DISAGREEMENT_RAD
-        regress(self._observed.fields(rows), (seen, expected), least, (before, now), found)
-        return found, kept
+        memory = memory.copy()
+        found = np.empty((len(rows), len(self.signals)))
+        regress(
+            observed=self._view.fields(rows),
+            seen=seen,
+            expected=expected,
+            carried_n=self._carried,
+            loaded_n=LOADED_SHARE * self._carried,
+            deviation_rad=DISAGREEMENT_RAD,
+            memory=memory,
+            found=found,
+        )
+        return found, memory
 
     def bending(self, rows: Array) -> Array:
         """Expected bending of the joints under the measured foot wrenches, δ = θ − q, (num_worlds, 12) [rad]."""
         theta = rows[:, self._theta]
-        return theta - self._compensator.at(rows).link_angle(theta, theta)
+        return theta - self._compensator.at(rows).link_angle(theta)
 
     def expected_tilt(self, rows: Array) -> Array:
         """By how much the bending tilts the pelvis over each foot if it is flat, s, (num_worlds, 2 legs, 2) [rad]."""
@@ -103,8 +120,63 @@ class BendingObserver:
         Returns:
             (num_worlds, 2 legs, 2) each, roll and pitch [rad].
         """
-        q, bent = (values.reshape(len(rows), 2, -1) for values in (rows[:, self._theta], bending))
+        q = rows[:, self._theta].reshape(len(rows), 2, -1)
+        bent = bending.reshape(len(rows), 2, -1)
         attitude = np.ascontiguousarray(rows[:, self._attitude])
         seen, expected = np.empty((2, len(rows), *_SHAPE))
         sole_tilts(self._model.biped.chains.axis, q, attitude, bent, seen, expected)
         return seen, expected
+
+
+@compiled
+def regress(
+    observed: Any,
+    seen: Array,
+    expected: Array,
+    carried_n: float,
+    loaded_n: float,
+    deviation_rad: float,
+    memory: Any,
+    found: Array,
+) -> None:
+    """One step of recursive least squares for seen − expected = ρ · expected + c, of feet that are loaded.
+
+    Args:
+        observed: Observations, rows with fields.
+        seen: Tilts of the soles, (n, 2, 2) [rad].
+        expected: Tilts that are expected, (n, 2, 2) [rad].
+        carried_n: Force that the feet carry [N].
+        loaded_n: Force of a loaded foot [N].
+        deviation_rad: Standard deviation of a measurement [rad].
+        memory: Rows of `ESTIMATE`, to be updated, (n,).
+        found: To be filled, (n, 9): ρ of legs and axes, their standard deviations, measured over assumed load less one.
+    """
+    for world in range(len(found)):
+        load = 0.0
+        for leg in range(2):
+            force = observed[world].wrench[leg, 0, 2]
+            load += force
+            for axis in range(2):
+                x = memory[world].unknowns[leg, axis]
+                P = memory[world].covariance[leg, axis]
+                if force >= loaded_n:
+                    update(x, P, expected[world, leg, axis], seen[world, leg, axis], deviation_rad)
+                found[world, 2 * leg + axis] = x[0]
+                found[world, 4 + 2 * leg + axis] = math.sqrt(P[0])
+        found[world, 8] = load / carried_n - 1.0
+
+
+@compiled
+def update(x: Array, P: Array, expected: float, seen: float, deviation_rad: float) -> None:
+    """A measurement of (expected, 1) · x = seen − expected, whose errors have a standard deviation."""
+    first = P[0] * expected + P[1]
+    second = P[1] * expected + P[2]
+    variance = (expected * first + second) + deviation_rad**2
+    error = (seen - expected) - (expected * x[0] + x[1])
+    gain = first / variance
+    second_gain = second / variance
+    x[0] += gain * error
+    x[1] += second_gain * error
+    P[0] -= gain * first
+    P[1] -= gain * second
+    P[2] -= second_gain * second

@@ -1,4 +1,4 @@
-r"""What a walker's IMU and foot sensors would show if the ground were level.
+r"""IMU and foot sensors of a walker as they would be on level ground.
 
 Seen from feet that lie flat, the force of the ground f carries the mass and accelerates it. What is left of its
 direction when the acceleration of the center of mass c is taken off is the tilt of the ground λ, whatever the joints
@@ -23,6 +23,8 @@ what the robot tilts by itself is
 On two feet that is too much about x, where a leaning weight goes from one foot to the other rather than to the ankles.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
@@ -30,17 +32,29 @@ from elastic_env.core.signals import Array, renamed
 from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
 from elastic_env.runtime.robot_model import WalkerModel
 
-TILT_RAD, VELOCITY_M_PER_S = 0.01, 0.07
+TILT_RAD = 0.01
+VELOCITY_M_PER_S = 0.07
 """σ_λ and σ_v: what the ground is tilted by before the first measurement, and how well velocities are known."""
 
 _DIFFERENCE_S = 1e-3
 
 
+class GroundMemory(NamedTuple):
+    """Memory of the tilt of the ground.
+
+    Attributes:
+        number: Measurements in the mean, (num_worlds,).
+        mean: Mean of the tilt about x and y, (num_worlds, 2) [rad].
+        velocity: Last one of the center of mass, (num_worlds, 2) [m/s]; nan before the first.
+    """
+
+    number: Array
+    mean: Array
+    velocity: Array
+
+
 class GroundLevel:
     """Attitude and foot wrenches without the tilt of the ground, from the observations of a walker.
-
-    Memory per world: number of measurements in the mean, the mean, and the last velocity of the center of mass, nan
-    before the first.
 
     Args:
         model: Assumed walker.
@@ -48,32 +62,32 @@ class GroundLevel:
         mean_s: Time constant of the mean, after as much time [s].
     """
 
-    memory_width = 1 + 2 + 2
-
     def __init__(self, model: WalkerModel, period_s: float, mean_s: float = 6.0) -> None:
         table = model.observation_table
-        self._attitude, self._wrench = table.group("imu_attitude"), table.group("wrench")
-        attitude, wrench = table.signals_of("imu_attitude"), table.signals_of("wrench")
-        self.signals = (*renamed(attitude, "own_tilt"), *renamed(wrench, "level_wrench"))
-        """What `observe` returns."""
-        self._theta, self._rate = table.group("encoder_angle"), table.group("encoder_rate")
-        self._carried, self._bending = model.biped.chains_above_feet, BendingObserver(model)
+        self._attitude = table.group("imu_attitude")
+        self._wrench = table.group("wrench")
+        own = renamed(table.signals_of("imu_attitude"), "own_tilt")
+        self.signals = (*own, *renamed(table.signals_of("wrench"), "level_wrench"))
+        """Values of `observe`."""
+        self._theta = table.group("encoder_angle")
+        self._rate = table.group("encoder_rate")
+        self._carried = model.biped.chains_above_feet
+        self._bending = BendingObserver(model)
         self._least_n = LOADED_SHARE * model.biped.weight
-        self._period_s, self._gravity = period_s, model.biped.gravity
+        self._period_s = period_s
+        self._gravity = model.biped.gravity
         self._least_gain = 1.0 - float(np.exp(-period_s / mean_s))
 
-    def begin(self, num_worlds: int) -> Array:
-        """Memory before the first measurement, (num_worlds, memory_width)."""
-        memory = np.zeros((num_worlds, self.memory_width))
-        memory[:, 3:] = np.nan
-        return memory
+    def begin(self, num_worlds: int) -> GroundMemory:
+        """Memory before the first measurement."""
+        return GroundMemory(np.zeros(num_worlds), np.zeros((num_worlds, 2)), np.full((num_worlds, 2), np.nan))
 
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+    def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         """Values after a measurement, see `signals`, and the new memory.
 
         Args:
             rows: Observations, (num_worlds, m).
-            memory: (num_worlds, memory_width).
+            memory: That of the last measurement.
         """
         lean, wrenches, memory = self.upright(rows, memory)
         level = rows.copy()
@@ -85,11 +99,12 @@ class GroundLevel:
         own = level[:, self._attitude] - (share[..., None] * further).sum(axis=1)
         return np.hstack([own, wrenches]), memory
 
-    def upright(self, rows: Array, memory: Array) -> tuple[Array, Array, Array]:
+    def upright(self, rows: Array, memory: GroundMemory) -> tuple[Array, Array, GroundMemory]:
         """Tilt of the ground, (num_worlds, 2) [rad], foot wrenches without it, (num_worlds, 12), and the new memory."""
         n = len(rows)
         wrench = rows[:, self._wrench].reshape(n, 2, 2, 3)
-        force, moment = wrench[:, :, 0], wrench[:, :, 1]
+        force = wrench[:, :, 0]
+        moment = wrench[:, :, 1]
         over_ankles, velocity = self._center_of_mass(rows, force[..., 2])
         mean, number = self._mean(force.sum(axis=1), velocity, memory)
         lean = mean * self._certainty(number)[:, None]
@@ -98,23 +113,23 @@ class GroundLevel:
         added = over_ankles * (upright - force)[..., :2]
         turned = moment + np.stack([-added[..., 1], added[..., 0], np.zeros_like(added[..., 0])], axis=-1)
         wrenches = np.stack([upright, turned], axis=2).reshape(n, -1)
-        return lean, wrenches, np.column_stack([number, mean, velocity])
+        return lean, wrenches, GroundMemory(number, mean, velocity)
 
     def _certainty(self, number: Array) -> Array:
         """How much of the mean the estimate is, 0 to 1."""
         change = self._gravity * TILT_RAD * self._period_s * number
         return change**2 / (change**2 + VELOCITY_M_PER_S**2)
 
-    def _mean(self, force: Array, velocity: Array, memory: Array) -> tuple[Array, Array]:
+    def _mean(self, force: Array, velocity: Array, memory: GroundMemory) -> tuple[Array, Array]:
         """The mean after a measurement, about x and y [rad], and of how many it is."""
-        number, mean, before = memory[:, 0], memory[:, 1:3], memory[:, 3:]
-        is_known = (force[:, 2] >= self._least_n) & np.isfinite(before).all(axis=1)
-        accelerated = (velocity - before) / (self._period_s * self._gravity)
+        is_known = (force[:, 2] >= self._least_n) & np.isfinite(memory.velocity).all(axis=1)
+        accelerated = (velocity - memory.velocity) / (self._period_s * self._gravity)
         direction = force[:, :2] / np.where(is_known, force[:, 2], np.inf)[:, None]
         seen = direction - np.where(is_known[:, None], accelerated, 0.0)
-        number = number + is_known
+        number = memory.number + is_known
         gain = is_known * np.maximum(1.0 / np.maximum(number, 1.0), self._least_gain)
-        return mean + gain[:, None] * (np.stack([seen[:, 1], -seen[:, 0]], axis=1) - mean), number
+        tilt = np.stack([seen[:, 1], -seen[:, 0]], axis=1)
+        return memory.mean + gain[:, None] * (tilt - memory.mean), number
 
     def _center_of_mass(self, rows: Array, load: Array) -> tuple[Array, Array]:
         """Of what the ankles carry: height over each, (n, 2, 1) [m]; velocity against the loaded one, (n, 2)."""

@@ -14,16 +14,18 @@ which the matrix inversion lemma solves in closed form.
 [Gelman2013] A. Gelman et al., "Bayesian Data Analysis", 3rd edition.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from baselines.compensation.compensators import GravityCompensator, presliding_friction
+from baselines.compensation.compensators import presliding_friction
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.runtime.robot_model import RobotModel
 
 
 class StiffnessPrior(Model):
-    """What is known of the joints before they are measured, as standard deviations."""
+    """Knowledge of the joints before they are measured, as standard deviations."""
 
     common: float = quantity("1", 0.5, gt=0, description="relative error that all joints share")
     own: float = quantity("1", 0.1, gt=0, description="relative error of a joint beside it")
@@ -31,7 +33,7 @@ class StiffnessPrior(Model):
     noise_rad: float = quantity("rad", 0.01, gt=0, description="model error of a measured deflection")
 
 
-def regressed(sums: Array, prior: StiffnessPrior) -> Array:
+def regress(sums: Array, prior: StiffnessPrior) -> Array:
     """Relative errors r of the joints by the regression of the module.
 
     Args:
@@ -45,50 +47,65 @@ def regressed(sums: Array, prior: StiffnessPrior) -> Array:
     counted = number + (prior.noise_rad / prior.offset_rad) ** 2  # c is eliminated
     information = (hh - h * h / counted) / prior.noise_rad**2
     right = (hy - h * y / counted) / prior.noise_rad**2
-    own, common, n = prior.own**2, prior.common**2, h.shape[-1]
+    own = prior.own**2
+    common = prior.common**2
+    n = h.shape[-1]
     diagonal = 1.0 / own + information
     rank_one = common / (own * (own + n * common))
-    alone, shared = right / diagonal, rank_one / diagonal
+    alone = right / diagonal
+    shared = rank_one / diagonal
     return alone + shared * (alone.sum(axis=-1) / (1.0 - shared.sum(axis=-1)))[..., None]
 
 
-class JointStiffnessObserver:
-    """Relative errors of the joints' deflections from measured ones, see the module.
+class RegressionMemory(NamedTuple):
+    """Memory of the regression.
 
-    Memory per world and joint: friction, last link angle, sums of the regression.
+    Attributes:
+        friction: That holds the links back, (num_worlds, n) [N·m].
+        q: Link angles of the last measurement, (num_worlds, n) [rad].
+        sums: As of `regress`, (num_worlds, 5, n).
+    """
+
+    friction: Array
+    q: Array
+    sums: Array
+
+
+class StiffnessRegression:
+    """The regression of the module, measurement by measurement.
 
     Args:
-        model: Assumed walker.
+        model: Assumed robot.
         prior: What is known before.
     """
 
-    def __init__(self, model: WalkerModel, prior: StiffnessPrior | None = None) -> None:
-        self._prior, self._n = prior or StiffnessPrior(), len(model.joint_names)
-        self._compensator = GravityCompensator(model, output="wrench")
-        self._theta = model.observation_table.group("encoder_angle")
-        self._coulomb, self._stiffness = model.coulomb_friction, model.stiffness
-        self.memory_width = 7 * self._n
+    def __init__(self, model: RobotModel, prior: StiffnessPrior) -> None:
+        self._prior = prior
+        self._coulomb = model.coulomb_friction
 
-    def begin(self, num_worlds: int) -> Array:
-        """Memory before the first measurement, (num_worlds, memory_width)."""
-        return np.zeros((num_worlds, self.memory_width))
+    def begin(self, num_worlds: int) -> RegressionMemory:
+        """Memory before the first measurement."""
+        n = len(self._coulomb)
+        return RegressionMemory(np.zeros((num_worlds, n)), np.zeros((num_worlds, n)), np.zeros((num_worlds, 5, n)))
 
-    def observe(self, rows: Array, deflection: Array, measured: BoolArray, memory: Array) -> tuple[Array, Array]:
+    def friction(self, q: Array, memory: RegressionMemory) -> Array:
+        """Coulomb friction of links that have moved to q, (num_worlds, n) [rad] to [N·m]."""
+        moved = np.where(memory.sums[:, 0] > 0.0, q - memory.q, 0.0)
+        return presliding_friction(memory.friction, moved, self._coulomb)
+
+    def add(
+        self, h: Array, deflection: Array, friction: Array, q: Array, memory: RegressionMemory, measured: BoolArray
+    ) -> tuple[Array, RegressionMemory]:
         """Relative errors r after a measurement, (num_worlds, n) [1], and the new memory.
 
         Args:
-            rows: Observations, (num_worlds, m).
-            deflection: Measured δ = θ − q, (num_worlds, n) [rad].
+            h: Expected deflection, (num_worlds, n) [rad].
+            deflection: Measured deflection [rad].
+            friction: As of `friction` [N·m].
+            q: Link angles [rad].
+            memory: That of the last measurement.
             measured: Which joints have a sensor, (n,).
-            memory: (num_worlds, memory_width).
         """
-        friction, last, *sums = memory.reshape(len(rows), 7, self._n).swapaxes(0, 1)
-        theta = rows[:, self._theta]
-        q = theta - deflection
-        moved = np.where(sums[0] > 0.0, q - last, 0.0)
-        friction = presliding_friction(friction, moved, self._coulomb)
-        h = theta - self._compensator.at(rows).link_angle(theta, theta) + friction / self._stiffness
         y = deflection - h
-        new = np.stack(sums) + measured * np.stack([np.ones_like(h), h, h * h, y, h * y])
-        kept = np.concatenate([friction[None], q[None], new]).swapaxes(0, 1).reshape(memory.shape)
-        return regressed(new, self._prior), kept
+        sums = memory.sums + measured * np.stack([np.ones_like(h), h, h * h, y, h * y], axis=1)
+        return regress(sums.swapaxes(0, 1), self._prior), RegressionMemory(friction, q, sums)

@@ -5,23 +5,37 @@ decided from the features of `baselines.residual.features` once in `decision_per
 its column it passes a first-order low-pass, and becomes an input of the base (`baselines.compensation.inputs`).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.compensation.inputs import inputs_of
-from baselines.compensation.policy import Action, ObservationView, Policy, predicted, taken_up
-from baselines.residual.channels import Channels
+from baselines.compensation.inputs import COMMAND, INPUTS, InputKind, input_signals, inputs_of
+from baselines.compensation.policy import (
+    NO_INPUTS,
+    ONE_WORLD,
+    Action,
+    ObservationView,
+    Policy,
+    PolicyInputs,
+    as_action,
+    as_batch_policy,
+    resume_memory,
+)
 from baselines.residual.settings import ResidualSettings
-from elastic_env.core.errors import ConfigurationError
-from elastic_env.core.signals import Array
+from elastic_env.core.errors import ConfigurationError, unknown_name
+from elastic_env.core.signals import Array, BoolArray, Signal
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+
+
+class CorrectedMemory(NamedTuple):
+    """Values of the inputs behind the low-pass, (num_worlds, width), and the memory of the base."""
+
+    values: Array
+    inner: Any
 
 
 class Corrected:
     """A base policy under a residual that somebody else decides.
-
-    Memory per world: the values of the inputs behind the low-pass.
 
     Args:
         base: Any policy that has the inputs; every policy has `command`.
@@ -44,15 +58,21 @@ class Corrected:
             raise ConfigurationError(
                 f"cautious goes by how the legs of a walker bend, got a {type(model).__name__}; set cautious: false"
             )
-        self.base, self.settings, self.model = base, settings, model
+        self.base = as_batch_policy(base, model.observation_table, model.control_period_s)
+        self.settings = settings
+        self.model = model
+        self.view = ObservationView(model.observation_table, model.control_period_s)
         self.channels = Channels(model, settings)
         self._share = 1.0 - float(np.exp(-2.0 * np.pi * settings.cutoff_hz * model.control_period_s))
-        self._view = ObservationView(model.observation_table, model.control_period_s)
 
     @property
     def num_residuals(self) -> int:
         """Numbers that make up a residual, k."""
         return len(self.channels.signals)
+
+    def begin(self, rows: Array) -> CorrectedMemory:
+        """Memory at the start of an episode, whose first observations are rows, (num_worlds, m)."""
+        return CorrectedMemory(np.zeros((len(rows), len(self.channels.bounds))), self.base.begin(rows))
 
     def act(
         self, observation: Array, residual: Array, state: Any = None, episode_start: Any = None
@@ -61,22 +81,128 @@ class Corrected:
 
         A residual that has been zero since the start of the episode gives the base's action to the last bit.
         """
-        rows = self._view.rows(observation)
-        values, inner = taken_up(
-            state, episode_start, rows, self._view, lambda: np.zeros((len(rows), self.channels.width))
-        )
-        values = self.channels.towards(values, residual, self._share)
-        inputs, offset = self.channels.inputs(values)
-        action, inner = predicted(self.base, observation, inputs, inner, episode_start, True)
-        if offset is not None:
-            action = (action + offset.reshape(np.shape(action))).astype(np.float32)
-        return action, (values, inner)
+        rows = self.view.rows(observation)
+        memory = resume_memory(self, rows, state, episode_start)
+        inputs = ONE_WORLD if np.ndim(observation) == 1 else NO_INPUTS
+        action, memory = self.correct(rows, residual, memory, inputs)
+        return as_action(action, inputs.is_single), memory
 
-    def base_action(self, observation: Array, state: Any, episode_start: Any) -> Action:
-        """What the base alone would command now."""
-        inner = None if state is None else state[1]
-        return self.base.predict(observation, inner, episode_start, True)[0]
+    def correct(
+        self, rows: Array, residual: Array, memory: CorrectedMemory, inputs: PolicyInputs
+    ) -> tuple[Array, CorrectedMemory]:
+        """`act` for rows: offsets of the joints, (num_worlds, n) [rad], and the new memory.
+
+        Args:
+            rows: Observations, (num_worlds, m).
+            residual: Within [−1, 1], (num_worlds, k).
+            memory: That of the last control step.
+            inputs: How `predict` was called; the residual sets their values.
+        """
+        values = self.channels.approach(memory.values, residual, self._share)
+        parts = self.channels.parts(values)
+        offset = parts.pop(COMMAND, None)
+        action, inner = self.base.act(rows, memory.inner, inputs._replace(**parts))
+        if offset is not None:
+            action = (action + offset).astype(np.float32)
+        return action, CorrectedMemory(values, inner)
+
+    def base_action(self, rows: Array, state: Any, episode_start: Any) -> Array:
+        """Command of the base alone, (num_worlds, n) [rad]."""
+        memory = resume_memory(self.base, rows, None if state is None else state.inner, episode_start)
+        return self.base.act(rows, memory, NO_INPUTS)[0]
 
     def link_estimate(self, observation: Array, state: Any) -> Array:
         """Estimated link angle for an observation and the state that `act` returned for it, (..., n) [rad]."""
-        return self.base.link_estimate(observation, state[1])  # type: ignore[attr-defined]
+        return self.base.link_estimate(observation, state.inner)
+
+
+class Channels:
+    """Columns on which a residual acts, by its settings: those of all its inputs, one input after the other.
+
+    Args:
+        model: What may be known of the robot.
+        settings: How the residual acts.
+
+    Attributes:
+        signals: The numbers of a residual, (k,), as signals; those that left and right share have no side.
+        bounds: Bound of every column, (width,); zero where the residual does not act.
+
+    Raises:
+        ConfigurationError: A joint or an axis that does not exist, or a joint without a bound.
+    """
+
+    def __init__(self, model: RobotModel, settings: ResidualSettings) -> None:
+        signals: dict[str, Signal] = {}
+        bounds: list[float] = []
+        sources: list[str | None] = []
+        self._columns: dict[str, slice] = {}
+        for name in settings.acts_on:
+            first = len(bounds)
+            of_input = _bounds(name, settings, model.joint_names).tolist()
+            for column, bound in zip(input_signals(name, model), of_input, strict=True):
+                shared = settings.shared and INPUTS[name].axes is None
+                source = _without_side(column.name) if shared else column.name
+                if bound > 0.0:
+                    signals.setdefault(source, column)
+                sources.append(source if bound > 0.0 else None)
+            bounds += of_input
+            self._columns[name] = slice(first, len(bounds))
+        self.bounds = np.array(bounds)
+        order = list(signals)
+        self._source = np.array([0 if source is None else order.index(source) for source in sources])
+        self.signals = tuple(_rename(signal, name) for name, signal in signals.items())
+
+    def approach(self, values: Array, residual: Array, share: float) -> Array:
+        """Values of all columns after a share of their way to what a residual wants, (num_worlds, width).
+
+        Args:
+            values: Before.
+            residual: Within [−1, 1], (num_worlds, k).
+            share: 1 for all of the way.
+        """
+        return values + share * (self.bounds * residual[:, self._source] - values)
+
+    def parts(self, values: Array) -> dict[str, Array]:
+        """Values by input, (..., width) to (..., columns of the input)."""
+        return {name: values[..., columns] for name, columns in self._columns.items()}
+
+
+def _bounds(name: str, settings: ResidualSettings, joint_names: list[str]) -> Array:
+    """Bound of every column of an input, (columns,); zero where the residual does not act."""
+    kind = INPUTS[name]
+    bound = settings.bounds[name]
+    names = kind.columns(joint_names)
+    chosen = np.ones(len(names), dtype=np.bool_)
+    if kind.axes is None and settings.joints is not None:
+        chosen = np.any([fit_columns(wanted, names, kind) for wanted in settings.joints], axis=0)
+    if not isinstance(bound, dict):
+        return np.where(chosen, bound, 0.0)
+    bounds = np.zeros(len(names))
+    for wanted, value in bound.items():
+        bounds[fit_columns(wanted, names, kind)] = value
+    missing = [column for column, acts in zip(names, chosen & (bounds == 0.0), strict=True) if acts]
+    if missing and kind.axes is None and settings.joints is not None:
+        raise ConfigurationError(f"{name} must have a bound for every joint of `joints`, none fits {missing}")
+    return np.where(chosen, bounds, 0.0)
+
+
+def fit_columns(wanted: str, names: list[str], kind: InputKind) -> BoolArray:
+    """Columns that are called so, or whose names end so.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    fits = np.array([name == wanted or name.endswith(f"_{wanted}") for name in names])
+    if not fits.any():
+        raise unknown_name("joint" if kind.axes is None else "axis of an input", wanted, names)
+    return fits
+
+
+def _without_side(name: str) -> str:
+    """A column's name without its side."""
+    group, _, part = name.partition(".")
+    return f"{group}.{part.removeprefix('l_').removeprefix('r_')}"
+
+
+def _rename(signal: Signal, name: str) -> Signal:
+    return Signal(name, signal.unit, signal.meaning, -1.0, 1.0, mirrored=signal.mirrored)

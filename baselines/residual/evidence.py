@@ -12,14 +12,19 @@ standard deviations: friction bends the joints of a leg that has not carried the
 where friction hides more of the bending than a small error would show.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from baselines.adaptation.estimators import mean_load
+from baselines.compensation.policy import Records
 from baselines.estimation.bending import BendingObserver
 from baselines.residual.correction import Corrected
 from elastic_env.core.signals import Array, SignalTable
 from elastic_env.runtime.robot_model import WalkerModel
 
-ERROR_SCALE, LOAD_SCALE = 0.1, 0.05
+ERROR_SCALE = 0.1
+LOAD_SCALE = 0.05
 """σ_ρ and σ_μ [1]: between what a right model shows in a walk, and errors that matter."""
 PRIOR_S = 0.5
 """Time for which the assumed load counts in the mean [s]: a robot that steps presses with more and with less."""
@@ -29,10 +34,15 @@ _ERROR, _UNCERTAINTY = (_SEEN.columns(f"{group}.l_roll", f"{group}.r_roll") for 
 _LOAD = _SEEN.names.index("excess_load")
 
 
+class EvidenceMemory(NamedTuple):
+    """Number and sum of the measured excess loads, (num_worlds, 2), and the memory of the observer."""
+
+    loads: Array
+    bending: Records
+
+
 class Evidence:
     """The evidence g, from 0 to 1, from the observations of a walker.
-
-    Memory per world: number of measurements, the sum of their excess loads, then that of the observer.
 
     Args:
         model: Assumed walker.
@@ -40,42 +50,28 @@ class Evidence:
     """
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
-        self._bending, self._prior = BendingObserver(model), PRIOR_S / period_s
-        self.memory_width = 2 + self._bending.memory_width
+        self._bending = BendingObserver(model)
+        self._prior_loads = PRIOR_S / period_s
 
-    def begin(self, num_worlds: int) -> Array:
-        """Memory before the first measurement, (num_worlds, memory_width)."""
-        return np.hstack([np.zeros((num_worlds, 2)), self._bending.begin(num_worlds)])
+    def begin(self, num_worlds: int) -> EvidenceMemory:
+        """Memory before the first measurement."""
+        return EvidenceMemory(np.zeros((num_worlds, 2)), self._bending.begin(num_worlds))
 
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+    def observe(self, rows: Array, memory: EvidenceMemory) -> tuple[Array, EvidenceMemory]:
         """Evidence after a measurement, (num_worlds, m) to (num_worlds, 1), and the new memory."""
-        seen, kept = self._bending.observe(rows, memory[:, 2:])
-        load = memory[:, :2] + np.column_stack([np.ones(len(rows)), seen[:, _LOAD]])
-        excess_load = load[:, 1] / (self._prior + load[:, 0])
-        g = evidence(seen[:, _ERROR], seen[:, _UNCERTAINTY], excess_load)
-        return g[:, None], np.hstack([load, kept])
+        seen, bending = self._bending.observe(rows, memory.bending)
+        excess_load, loads = mean_load(memory.loads, seen[:, [_LOAD]], self._prior_loads)
+        g = evidence(seen[:, _ERROR], seen[:, _UNCERTAINTY], excess_load[:, 0])
+        return g[:, None], EvidenceMemory(loads, bending)
 
 
-class Unreserved:
-    """Caution that lets everything pass; see `Evidence`."""
-
-    memory_width = 0
-
-    def begin(self, num_worlds: int) -> Array:
-        """No memory, (num_worlds, 0)."""
-        return np.zeros((num_worlds, 0))
-
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
-        """Ones, (num_worlds, 1)."""
-        return np.ones((len(rows), 1)), memory
-
-
-def caution(corrected: Corrected) -> Evidence | Unreserved:
-    """What says how far a residual may act."""
-    model, settings = corrected.model, corrected.settings
+def caution(corrected: Corrected) -> Evidence | None:
+    """Judge of how far a residual may act; None for one that is not cautious."""
+    model = corrected.model
+    settings = corrected.settings
     if settings.cautious and isinstance(model, WalkerModel):  # `Corrected` refuses it for other robots
         return Evidence(model, settings.decision_period * model.control_period_s)
-    return Unreserved()
+    return None
 
 
 def evidence(model_error: Array, uncertainty: Array, excess_load: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a residual is decided by: groups of the observation, and what can be said from it, the plan and the model.
+"""Features that decide a residual: groups of the observation, and what can be said from it, the plan and the model.
 
 | name | what it is |
 |---|---|
@@ -13,12 +13,13 @@
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from baselines.compensation.policy import put_rows, select_rows
 from baselines.estimation.bending import BendingObserver
-from baselines.estimation.ground_level import GroundLevel
+from baselines.estimation.ground_level import GroundLevel, GroundMemory
 from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from elastic_env.core.errors import ConfigurationError, unknown_name
@@ -26,32 +27,36 @@ from elastic_env.core.signals import Array, BoolArray, Signal, renamed
 from elastic_env.dynamics.ground_contact import zero_moment_point
 from elastic_env.runtime.robot_model import RobotModel, WalkerModel
 
-OBSERVATION, BASE_ACTION = "observation", "base_action"
+OBSERVATION = "observation"
+BASE_ACTION = "base_action"
 
 
 class Source(Protocol):
-    """Some features from observations, with a memory per world."""
-
-    memory_width: int
+    """Some features from observations; its memory is an array or a named tuple, one row per world."""
 
     @property
     def signals(self) -> tuple[Signal, ...]:
-        """What its features are."""
+        """Signals of its features."""
         ...
 
-    def begin(self, num_worlds: int) -> Array:
-        """Memory before the first measurement, (num_worlds, memory_width)."""
+    def begin(self, num_worlds: int) -> Any:
+        """Memory before the first measurement."""
         ...
 
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+    def observe(self, rows: Array, memory: Any) -> tuple[Array, Any]:
         """Features of observations, (num_worlds, m) to (num_worlds, signals), and the new memory."""
         ...
 
 
-class Features:
-    """What a residual is decided by, in the order of the settings; the base's action and earlier measurements last.
+class FeaturesMemory(NamedTuple):
+    """Measurements of the last decisions, (num_worlds, history · k), the latest first; memory of the sources."""
 
-    Memory per world: measurements of the last decisions, the latest first, then that of the sources.
+    past: Array
+    sources: tuple[Any, ...]
+
+
+class Features:
+    """Features that decide a residual, in the order of the settings; the base's action and earlier measurements last.
 
     Args:
         corrected: The base and its correction.
@@ -61,63 +66,67 @@ class Features:
     """
 
     def __init__(self, corrected: Corrected) -> None:
-        self._corrected, settings, model = corrected, corrected.settings, corrected.model
-        names = _named(settings.observe, model)
+        settings = corrected.settings
+        model = corrected.model
+        self._corrected = corrected
         period_s = settings.decision_period * model.control_period_s
-        self._sources = [_source(name, model, period_s) for name in names]
+        self._sources = [_source(name, model, period_s) for name in _source_names(settings.observe, model)]
         self._acts = BASE_ACTION in settings.observe
         seen = [signal for source in self._sources for signal in source.signals]
         self._measured = np.array([i for i, signal in enumerate(seen) if signal.kind == "measured"], dtype=np.int64)
         self._history = settings.history
-        past = self._history * len(self._measured)
-        self._ends = np.cumsum([past, *(source.memory_width for source in self._sources)])
         commands = renamed(model.observation_table.signals_of("last_command"), BASE_ACTION) if self._acts else ()
         self.signals = (*seen, *commands)
-        self.width = len(self.signals) + past
-        self.memory_width = int(self._ends[-1])
+        self.width = len(self.signals) + self._history * len(self._measured)
         measured = [seen[i] for i in self._measured]
         self._mirror = LeftFirst(self.signals, measured, corrected) if settings.mirror else None
 
+    def begin(self, num_worlds: int) -> FeaturesMemory:
+        """Memory before the first decision."""
+        past = np.zeros((num_worlds, self._history * len(self._measured)))
+        return FeaturesMemory(past, tuple(source.begin(num_worlds) for source in self._sources))
+
     def at(
-        self, rows: Array, memory: Array | None, fresh: BoolArray, state: Any, episode_start: Any
-    ) -> tuple[Array, Array]:
+        self, rows: Array, memory: FeaturesMemory | None, fresh: BoolArray, state: Any, episode_start: Any
+    ) -> tuple[Array, FeaturesMemory]:
         """Features of a decision, and the memory for the next one.
 
         Args:
             rows: Observations, (num_worlds, m).
-            memory: That of the last decision, (num_worlds, memory_width); None at the first.
+            memory: That of the last decision; None at the first.
             fresh: Worlds that decide for the first time in their episode.
             state: State of the corrected policy.
             episode_start: Worlds whose episode begins, for the policy.
 
         Returns:
-            (num_worlds, width) and (num_worlds, memory_width).
+            (num_worlds, width), and the memory.
         """
         n = len(rows)
-        begun = np.hstack([np.zeros((n, self._ends[0])), *(source.begin(n) for source in self._sources)])
-        memory, fresh = (begun, np.ones_like(fresh)) if memory is None else (memory, fresh)
-        past, *memories = np.split(np.where(fresh[:, None], begun, memory), self._ends[:-1], axis=1)
-        observed = [source.observe(rows, own) for source, own in zip(self._sources, memories, strict=True)]
+        begun = self.begin(n)
+        if memory is None:
+            fresh = np.ones_like(fresh)
+        kept: FeaturesMemory = begun if memory is None else put_rows(memory, fresh, select_rows(begun, fresh))
+        observed = [source.observe(rows, own) for source, own in zip(self._sources, kept.sources, strict=True)]
         seen = np.hstack([np.zeros((n, 0)), *(values for values, _ in observed)])
         measured = seen[:, self._measured]
-        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), past)
+        past = np.where(fresh[:, None], np.tile(measured, (1, self._history)), kept.past)
         parts = [seen]
         if self._acts:
-            parts.append(np.asarray(self._corrected.base_action(rows, state, episode_start), dtype=np.float64))
-        remembered = np.hstack([measured, past])[:, : past.shape[1]]
+            parts.append(self._corrected.base_action(rows, state, episode_start).astype(np.float64))
         features = np.hstack([*parts, past])
         if self._mirror is not None:
             features = self._mirror(rows, features)
-        return features, np.hstack([remembered, *(kept for _, kept in observed)])
+        remembered = np.hstack([measured, past])[:, : past.shape[1]]
+        return features, FeaturesMemory(remembered, tuple(own for _, own in observed))
 
-    def turned_back(self, rows: Array, residual: Array) -> Array:
-        """What a residual comes to that was decided in the mirror, (num_worlds, k); itself without one.
+    def turn_back(self, rows: Array, residual: Array) -> Array:
+        """Residual as it acts, of one that was decided in the mirror, (num_worlds, k); itself without one.
 
         Args:
             rows: Observations of the decision.
             residual: What was decided by their features.
         """
-        return residual if self._mirror is None else self._mirror.turned_back(rows, residual)
+        return residual if self._mirror is None else self._mirror.turn_back(rows, residual)
 
 
 def _groups(model: RobotModel) -> list[str]:
@@ -125,7 +134,7 @@ def _groups(model: RobotModel) -> list[str]:
     return list(dict.fromkeys(name.split(".")[0] for name in model.observation_table.names))
 
 
-def _named(observe: tuple[str, ...], model: RobotModel) -> list[str]:
+def _source_names(observe: tuple[str, ...], model: RobotModel) -> list[str]:
     """Names of the sources, with all groups for the whole observation."""
     names = [group for name in observe for group in (_groups(model) if name == OBSERVATION else [name])]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -154,10 +163,9 @@ def _source(name: str, model: RobotModel, period_s: float) -> Source:
 class _Instant:
     """A source that remembers nothing."""
 
-    memory_width = 0
-
     def __init__(self, signals: tuple[Signal, ...], function: Callable[[Array], Array]) -> None:
-        self.signals, self._function = signals, function
+        self.signals = signals
+        self._function = function
 
     def begin(self, num_worlds: int) -> Array:
         return np.zeros((num_worlds, 0))
@@ -192,17 +200,18 @@ class _ContactError:
     _LEAST_N = 50.0
 
     def __init__(self, model: WalkerModel, period_s: float) -> None:
-        table, biped = model.observation_table, model.biped
+        table = model.observation_table
+        biped = model.biped
         self._level = GroundLevel(model, period_s)
-        self.memory_width = self._level.memory_width
-        self._share, self._zmp = table.group("load_share"), table.group("zmp_reference")
+        self._share = table.group("load_share")
+        self._zmp = table.group("zmp_reference")
         self._sensors = biped.foot_sensors
         self._ankles = biped.ankles
 
-    def begin(self, num_worlds: int) -> Array:
+    def begin(self, num_worlds: int) -> GroundMemory:
         return self._level.begin(num_worlds)
 
-    def observe(self, rows: Array, memory: Array) -> tuple[Array, Array]:
+    def observe(self, rows: Array, memory: GroundMemory) -> tuple[Array, GroundMemory]:
         _, wrenches, memory = self._level.upright(rows, memory)
         wrench = wrenches.reshape(-1, 2, 2, 3)
         force, moment = self._sensors.ground_wrench(wrench, np.broadcast_to(np.eye(3), (len(rows), 2, 3, 3)))

@@ -25,7 +25,7 @@ _SIDE = re.compile(r"(?<=\.)[lr]_")
 
 
 class Mirror:
-    """What signals of a walker are in its mirror.
+    """Image of a walker's signals in its mirror.
 
     Args:
         signals: What the columns hold, with the sides l_ and r_ behind a dot.
@@ -64,7 +64,8 @@ class LeftFirst:
     """
 
     def __init__(self, signals: Sequence[Signal], measured: Sequence[Signal], corrected: Corrected) -> None:
-        model, settings = corrected.model, corrected.settings
+        model = corrected.model
+        settings = corrected.settings
         if not isinstance(model, WalkerModel):
             raise ConfigurationError(
                 f"mirror is for a walker, whose legs are mirror images, got a {type(model).__name__}; set mirror: false"
@@ -82,8 +83,11 @@ class LeftFirst:
                 f"mirror needs joints and bounds that are the same on both legs, they are not for {', '.join(unlike)}; "
                 "name joints without l_ and r_, or mirror: false"
             )
-        self._now, self._past, self._residual = Mirror(signals), Mirror(measured), Mirror(corrected.channels.signals)
-        self._split, self._earlier = len(signals), (settings.history, len(measured))
+        self._now = Mirror(signals)
+        self._past = Mirror(measured)
+        self._residual = Mirror(corrected.channels.signals)
+        self._split = len(signals)
+        self._earlier = (settings.history, len(measured))
         self._support = model.observation_table.columns("clock.support")
 
     def __call__(self, rows: Array, features: Array) -> Array:
@@ -100,7 +104,7 @@ class LeftFirst:
         past = self._past(past.reshape(len(past), *self._earlier)).reshape(past.shape)
         return np.where(rows[:, self._support] == 1.0, np.hstack([self._now(now), past]), features)
 
-    def turned_back(self, rows: Array, residual: Array) -> Array:
+    def turn_back(self, rows: Array, residual: Array) -> Array:
         """A residual as it acts, (num_worlds, k): what was decided in the mirror is its mirror image."""
         return np.where(rows[:, self._support] == 1.0, self._residual(residual), residual)
 

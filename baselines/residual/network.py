@@ -6,20 +6,22 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from baselines.residual.residual_kernels import affine
+from elastic_env.core.compiled import compiled
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.signals import Array
 
+Single = npt.NDArray[np.float32]
 Tensors = Mapping[str, npt.NDArray[Any]]
 """`mean` and `std` of the features, `weight0`, `bias0`, `weight1`, ..."""
 
 _ACTIVATIONS = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, np.float32(0.0))}
-_MOST_LAYERS, _LARGEST = 10, 1e6
+_MOST_LAYERS = 10
+_LARGEST = 1e6
 _TYPES = ("float32", "float64")
 
 
 class NetworkSettings(Protocol):
-    """What a network is beside its tensors."""
+    """Settings of a network beside its tensors."""
 
     @property
     def activation(self) -> Literal["tanh", "relu"]:
@@ -88,12 +90,14 @@ class Network:
 
     def __init__(self, settings: NetworkSettings, tensors: Tensors) -> None:
         depth = require_network(tensors)
-        self._mean, self._std = tensors["mean"].astype(np.float64), tensors["std"].astype(np.float64)
+        self._mean = tensors["mean"].astype(np.float64)
+        self._std = tensors["std"].astype(np.float64)
         self._layers = [
             (np.ascontiguousarray(tensors[f"weight{i}"].astype(np.float32).T), tensors[f"bias{i}"].astype(np.float32))
             for i in range(depth)
         ]
-        self._activation, self._output = _ACTIVATIONS[settings.activation], settings.output
+        self._activation = _ACTIVATIONS[settings.activation]
+        self._output = settings.output
         self._clip = settings.clip
 
     @property
@@ -115,3 +119,17 @@ class Network:
                 x = self._activation(x)
         x = np.tanh(x) if self._output == "tanh" else np.clip(x, -1.0, 1.0)
         return x.astype(np.float64)
+
+
+@compiled
+def affine(rows: Single, W: Single, b: Single) -> Single:
+    """Give x W + b of every row x, in single precision, (n, k) to (n, m); all rows are added up in the same order."""
+    out = np.empty((len(rows), len(b)), dtype=np.float32)
+    for row in range(len(rows)):
+        for j in range(len(b)):
+            out[row, j] = b[j]
+        for i in range(W.shape[0]):  # along the outputs, whose sums are apart, the processor works on several at once
+            x = rows[row, i]
+            for j in range(len(b)):
+                out[row, j] += x * W[i, j]
+    return out

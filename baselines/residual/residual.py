@@ -7,23 +7,23 @@ no code from it and needs no torch. The observation is normalised in here; the b
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import ConfigDict, Field, field_validator
 from safetensors.numpy import save
+from typing_extensions import override
 
-from baselines.compensation.policy import Action, ObservationView, Policy, taken_up
-from baselines.residual.correction import Corrected
-from baselines.residual.evidence import caution
-from baselines.residual.features import Features
+from baselines.compensation.policy import BatchPolicy, Policy, PolicyInputs, put_rows, select_rows
+from baselines.residual.correction import Corrected, CorrectedMemory
+from baselines.residual.evidence import EvidenceMemory, caution
+from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network, Tensors
-from baselines.residual.residual_kernels import count_due, count_step
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.config import MOST_ENTRIES, Model, Title, load_json, quantity
 from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.files import write_whole
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.core.tensors import read_tensors
 
 RESIDUAL = "residual:"
@@ -33,7 +33,7 @@ _SHIPPED = Path(__file__).parents[1] / "trained"
 
 
 class TrainedOn(Model):
-    """What comparisons read of the configuration of a training."""
+    """Part of the configuration of a training that comparisons read."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -43,7 +43,7 @@ class TrainedOn(Model):
 
 
 class Origin(Model):
-    """What comparisons read of how a residual was trained; the rest of it is for people."""
+    """Part of the origin of a residual that comparisons read; the rest of it is for people."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -53,7 +53,7 @@ class Origin(Model):
 
 
 class ResidualDescription(Model):
-    """What `residual.json` says of the weights beside it."""
+    """Content of `residual.json`, about the weights beside it."""
 
     robot: Title
     """Task of the environment, walker or testbed."""
@@ -101,11 +101,26 @@ def require_plain_base(name: str) -> str:
     return name
 
 
-class ResidualPolicy:
-    """A base policy with a network that corrects it.
+class ResidualMemory(NamedTuple):
+    """Memory of a residual policy.
 
-    Memory per world: control steps since the last decision, the residual that was decided, that of the features, and
-    that of caution.
+    Attributes:
+        wait: Control steps until the next decision, (num_worlds,); -1 before the first.
+        residual: What was decided, (num_worlds, k).
+        features: Memory of the features.
+        caution: Memory of the evidence, None without caution.
+        inner: Memory of the corrected base.
+    """
+
+    wait: IntArray
+    residual: Array
+    features: FeaturesMemory
+    caution: EvidenceMemory | None
+    inner: CorrectedMemory
+
+
+class ResidualPolicy(BatchPolicy):
+    """A base policy with a network that corrects it.
 
     Args:
         corrected: The base and its correction.
@@ -116,54 +131,56 @@ class ResidualPolicy:
     """
 
     def __init__(self, corrected: Corrected, network: Network) -> None:
-        self.corrected, self._network = corrected, network
-        self._features, self._period = Features(corrected), corrected.settings.decision_period
-        expected = self._features.width, corrected.num_residuals
+        model = corrected.model
+        super().__init__(model.observation_table, model.control_period_s)
+        self.corrected = corrected
+        self._network = network
+        self._features = Features(corrected)
+        self._period = corrected.settings.decision_period
+        expected = (self._features.width, corrected.num_residuals)
         if (network.num_features, network.num_outputs) != expected:
             raise ConfigurationError(
                 f"the network must take {expected[0]} features and give {expected[1]} residuals for these settings, "
                 f"it has {network.num_features} and {network.num_outputs}"
             )
-        model = corrected.model
         self._caution = caution(corrected)
-        self._ends = np.cumsum([1, corrected.num_residuals, self._features.memory_width])
-        self._view = ObservationView(model.observation_table, model.control_period_s)
 
-    def predict(
-        self,
-        observation: Array,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,  # noqa: ARG002  the interface's
-    ) -> tuple[Action, Any]:
-        """Corrected action and new state."""
-        rows = self._view.rows(observation)
-        memory, inner = taken_up(state, episode_start, rows, self._view, lambda: self._undecided(len(rows)))
-        memory = memory.copy()
-        if count_due(memory) > 0:
-            due = np.flatnonzero(memory[:, 0] <= 0.0)
-            fresh = memory[:, 0] == _UNDECIDED
-            _, _, past, known = np.split(memory, self._ends, axis=1)
-            features, past = self._features.at(rows, past, fresh, inner, episode_start)
-            trust, known = self._caution.observe(rows, np.where(fresh[:, None], self._caution.begin(len(rows)), known))
-            decided = self._features.turned_back(rows[due], self._network(features[due])) * trust[due]
-            memory[due] = np.hstack([np.zeros((len(due), 1)), decided, past[due], known[due]])
-        residual = memory[:, self._ends[0] : self._ends[1]]
-        action, inner = self.corrected.act(observation, residual, inner, episode_start)
-        count_step(memory, self._period)
-        return action, (memory, inner)
+    @override
+    def begin(self, rows: Array) -> ResidualMemory:
+        return ResidualMemory(
+            wait=np.full(len(rows), _UNDECIDED),
+            residual=np.zeros((len(rows), self.corrected.num_residuals)),
+            features=self._features.begin(len(rows)),
+            caution=self._caution.begin(len(rows)) if self._caution is not None else None,
+            inner=self.corrected.begin(rows),
+        )
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """See `Corrected`."""
-        return self.corrected.link_estimate(observation, state[1])
+    @override
+    def act(self, rows: Array, memory: ResidualMemory, inputs: PolicyInputs) -> tuple[Array, ResidualMemory]:
+        due = memory.wait <= 0
+        if np.count_nonzero(due) > 0:
+            memory = put_rows(memory, due, select_rows(self._decide(rows, memory, due), due))
+        action, inner = self.corrected.correct(rows, memory.residual, memory.inner, inputs)
+        return action, memory._replace(wait=memory.wait - 1, inner=inner)
 
-    def _undecided(self, num_worlds: int) -> Array:
-        memory = np.zeros((num_worlds, self._ends[-1] + self._caution.memory_width))
-        memory[:, 0] = _UNDECIDED
-        return memory
+    @override
+    def link_angles(self, rows: Array, memory: ResidualMemory) -> Array:
+        return self.corrected.base.link_angles(rows, memory.inner.inner)
+
+    def _decide(self, rows: Array, memory: ResidualMemory, due: BoolArray) -> ResidualMemory:
+        """Memory after a decision, of the worlds that are due."""
+        seen, features = self._features.at(rows, memory.features, memory.wait == _UNDECIDED, memory.inner, None)
+        known = None
+        residual = memory.residual.copy()
+        residual[due] = self._features.turn_back(rows[due], self._network(seen[due]))
+        if self._caution is not None and memory.caution is not None:
+            trust, known = self._caution.observe(rows, memory.caution)
+            residual[due] *= trust[due]
+        wait = np.full_like(memory.wait, self._period)
+        return ResidualMemory(wait, residual, features, known, memory.inner)
 
 
-_UNDECIDED = -1.0
+_UNDECIDED = -1
 
 
 def save_residual(folder: Path, description: ResidualDescription, tensors: Tensors) -> None:
@@ -195,7 +212,7 @@ def located(folder: Path) -> Path:
 
 
 def read_description(folder: Path) -> ResidualDescription:
-    """What a residual says of itself; `folder` is a path or the name of a shipped one.
+    """Description of a residual; `folder` is a path or the name of a shipped one.
 
     Raises:
         ConfigurationError: There is none, or it is not valid.
@@ -211,7 +228,7 @@ def read_description(folder: Path) -> ResidualDescription:
 
 
 def _none_at(folder: Path, why: str) -> str:
-    """What to do where no residual is, in a sentence."""
+    """Sentence that says what to do where no residual is."""
     try:
         inside = [path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{DESCRIPTION}")]
     except OSError:  # a name that is too long, or a folder that cannot be read

@@ -30,16 +30,16 @@ class ResidualSettings(Model):
     """Joints in which it acts, where an input has one column per joint, by the end of their names (ankle_roll means
     both); None for all."""
     shared: bool = False
-    """Whether left and right joints of the same name share their residual: there are half as many to explore, and one
+    """Left and right joints of the same name share their residual: there are half as many to explore, and one
     that follows the step still tells the legs apart by which of them carries the robot."""
     mirror: bool = False
-    """Whether it sees a step on the right foot in the mirror, as a step on the left, and what it decides is turned back
+    """It sees a step on the right foot in the mirror, as a step on the left, and what it decides is turned back
     (`baselines.residual.mirror`). For a walker."""
     cautious: bool = False
-    """Whether it is played only as far as there is `evidence` that the model is wrong (`baselines.residual.evidence`),
+    """It is played only as far as there is `evidence` that the model is wrong (`baselines.residual.evidence`),
     and else leaves the base alone. In training, under the wrappers of `train`, it acts freely. For a walker."""
     observe: tuple[Title, ...] = Field(default=("observation",), min_length=1, max_length=MOST_ENTRIES)
-    """What it sees: groups of the observation such as (clock, load_share), or all of it, and what
+    """Features that it sees: groups of the observation such as (clock, load_share), or all of it, and what
     `baselines.residual.features` makes of it and of the plan."""
     history: int = quantity("1", 0, ge=0, le=1000, description="earlier decisions whose measurements it sees as well")
 

@@ -19,21 +19,22 @@ re-taken at every support change. The center of mass in it follows from joint an
 [Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.compensation_kernels import shifted_shares
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.observed import ObservedWalk, Records
-from baselines.compensation.policy import Action, ObservationView, PolicyWithInputs, taken_up
-from baselines.walking import walking_kernels as kernels
-from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share
+from baselines.compensation.contact_torque import shifted_shares
+from baselines.compensation.policy import NO_INPUTS, ONE_WORLD, BatchPolicy, PolicyInputs, Records, WalkView
+from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, following_share, move_pelvis
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.biped import Biped
+from elastic_env.dynamics.leg_kernels import local_frames
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -82,11 +83,59 @@ def _sole(biped: Biped) -> Array:
     return np.array([0.0, 0.0, -biped.ankle_height])
 
 
-class WalkingController(PolicyWithInputs):
-    """Commands a walker around its plan, see the module.
+CONTROLLER = record_type(
+    period_s=(),
+    is_com_fed_back=bool,
+    thigh=(),  # [m]
+    shank=(),  # [m]
+    footholds=(2, 2),  # [m]
+    weight=(),  # of the robot [N]
+    weight_of_feet=(),  # below the sensors [N]
+    omega=(),  # of the pendulum [rad/s]
+    following_share=(),  # of its way in a period [1]
+    per_pelvis=(2,),  # motion of the center of mass per motion of the pelvis [1]
+    ankle_stiffness=(2, 2),  # pitch and roll of the legs [N·m/rad]
+    friction_deflection=(2, 6),  # [rad]
+    friction_rate_rad_s=(),
+    force_difference=(),
+    force_difference_decay_s=(),
+    force_difference_limit_m=(),
+    dcm=(),
+    zmp_limit_m=(),
+    velocity_share=(),  # of a step in a period [1]
+    zmp_share=(),  # likewise
+    weight_share=(),  # likewise
+)
+"""Assumptions of the controller, and its gains."""
 
-    Memory per world: steps, leg length difference, COM from both soles, deviation of its velocity, ZMP shift,
-    shift of the planned COM for the input `zmp` and in all, weight.
+PLAN = record_type(share=(), com=(2,), com_dot=(2,))
+"""Load share of the right foot, and center of mass of the plan, one row per control step."""
+
+MEMORY = record_type(
+    steps=(),
+    difference=(),  # of the leg lengths [m]
+    com=(2, 2),  # from both soles [m]
+    velocity=(2,),  # its deviation from the plan [m/s]
+    shift=(2,),  # of the ZMP [m]
+    following=(2,),  # shift of the planned center of mass for the input `zmp` [m]
+    planned=(2,),  # that shift in all [m]
+    weight=(),  # as measured [N]
+)
+"""Memory of the controller."""
+
+INPUTS = record_type(
+    zmp=(2,),  # [m]
+    com=(2,),  # [m]
+    leg_length=(),  # [m]
+    hip=(2, 2),  # roll and pitch of either leg [rad]
+    balance_gain=(),  # relative change [1]
+    deflection=(2, 6),  # relative change [1]
+)
+"""Inputs from outside; zeros are as if there were none, to the last bit."""
+
+
+class WalkingController(BatchPolicy):
+    """Commands a walker around its plan, see the module; its memory is rows of `MEMORY`.
 
     Args:
         model: Assumed walker.
@@ -105,98 +154,123 @@ class WalkingController(PolicyWithInputs):
         gains: WalkingGains | None = None,
         ramp_s: float = STAND_S,
     ) -> None:
-        self._biped, plan = model.biped, model.plan
         table = model.observation_table
-        self._view, self._observed = ObservationView(table, model.control_period_s), ObservedWalk(table)
-        self._attitude, steps = table.group("imu_attitude"), max(round(ramp_s / model.control_period_s), 1)
+        super().__init__(table, model.control_period_s)
+        self._biped = model.biped
+        self._walk_view = WalkView(table)
+        self._attitude = table.group("imu_attitude")
+        self._theta = table.group("encoder_angle")
+        steps = max(round(ramp_s / model.control_period_s), 1)
         self._ramp = minimum_jerk(np.arange(steps + 1) / steps)
-        self._constants: Any = np.array([_constants(model, com_feedback, gains or WalkingGains())], kernels.CONTROLLER)
-        self._plan_rows: Any = np.zeros(plan.num_steps + 1, kernels.PLAN)
-        for name in kernels.PLAN.names or ():
-            self._plan_rows[name] = getattr(plan, name)
-        self._planned_shares, self._period_s = np.ascontiguousarray(plan.share), model.control_period_s
-        self._stances, self._sole = Stances.of(model), _sole(self._biped)
+        self._constants = _constants(model, com_feedback, gains or WalkingGains())
+        plan = model.plan
+        self._plan: Any = np.zeros(plan.num_steps + 1, PLAN)
+        for name in PLAN.names or ():
+            self._plan[name] = getattr(plan, name)
+        self._planned_shares = np.ascontiguousarray(plan.share)
+        self._period_s = model.control_period_s
+        self._stances = Stances.of(model)
+        self._sole = _sole(self._biped)
+        self._foot_spacing = self._biped.foot_spacing
 
     @property
+    @override
     def inputs(self) -> tuple[str, ...]:
-        """See `PolicyWithInputs`."""
         return ("zmp", "com", "leg_length", "hip", "balance_gain")
 
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,  # noqa: ARG002
-    ) -> tuple[Action, Any]:
-        """Offsets of the twelve joints [rad], and new state.
-
-        A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as much.
-        """
-        rows = self._view.rows(observation)
-        n, attitude = len(rows), rows[:, self._attitude]
-        com, soles = self._biped.chains.com_and_feet(self._view.theta(rows).reshape(n, 2, 6), self._sole, attitude)
-        memory, _ = taken_up(state, episode_start, rows, self._view, lambda: self._begin(LocalFrame(com, soles)))
-        kept, action = np.empty(memory.shape), np.empty((n, 12))
-        before, now = self._fields(memory), self._fields(kept)
-        observed = self._observed.fields(rows)
-        seen = observed, com, soles, self._shares(observed, inputs.zmp_shift)
-        walk = self._constants, self._plan_rows, *self._stances, self._ramp
-        kernels.control(walk, seen, _dense(inputs, n), before, now, action)
-        return action.astype(np.float32).reshape((*observation.shape[:-1], action.shape[-1])), (kept, None)
-
-    def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002
-        """The encoder angles, (..., 12) [rad]: without an output compensator it takes motors for links."""
-        rows = self._view.rows(observation)
-        return self._view.theta(rows).reshape((*observation.shape[:-1], -1))
-
-    def _begin(self, frame: LocalFrame) -> Array:
-        memory = np.zeros((len(frame.com), kernels.MEMORY.itemsize // 8))
-        fields = self._fields(memory)
-        fields["com"], fields["weight"] = frame.com_from_soles[..., :2], self._biped.weight
+    @override
+    def begin(self, rows: Array) -> Records:
+        memory = np.zeros(len(rows), MEMORY)
+        memory["weight"] = self._biped.weight
         return memory
 
-    def _fields(self, memory: Array) -> Records:
-        """Memory, (num_worlds, 15), as rows with fields."""
-        return np.ndarray(len(memory), kernels.MEMORY, np.ascontiguousarray(memory))
+    @override
+    def act(self, rows: Array, memory: Records, inputs: PolicyInputs) -> tuple[Array, Records]:
+        """A `deflection` r, which a compensator may hand on, winds the springs by 1 + r times as much."""
+        observed = self._walk_view.fields(rows)
+        com, soles = self._local_frame(rows)
+        action = np.empty((len(rows), 12))
+        now = np.empty(len(rows), MEMORY)
+        coming = np.empty(len(rows), dtype=np.int64)
+        pelvis = np.empty((len(rows), 2))
+        is_moved = control(
+            controller=self._constants,
+            plan=self._plan,
+            ramp=self._ramp,
+            observed=observed,
+            com=com,
+            soles=soles,
+            shares=self._shares(observed, inputs.zmp_shift),
+            inputs=_dense(inputs, len(rows)),
+            before=memory,
+            now=now,
+            coming=coming,
+            pelvis=pelvis,
+            action=action,
+        )
+        if is_moved:
+            move_pelvis(*self._stances, steps=coming, shift=pelvis, offset=action)
+        return action.astype(np.float32), now
+
+    def _local_frame(self, rows: Array) -> tuple[Array, Array]:
+        """Center of mass, (num_worlds, 3), and soles, (num_worlds, 2, 3), level and relative to the pelvis [m]."""
+        q = np.ascontiguousarray(rows[:, self._theta]).reshape(-1, 2, 6)
+        com = np.empty((len(rows), 3))
+        soles = np.empty((len(rows), 2, 3))
+        attitude = np.ascontiguousarray(rows[:, self._attitude])
+        local_frames(self._biped.chains.legs, q, attitude, self._sole, com, soles)
+        return com, soles
 
     def _shares(self, observed: Records, shift: Array | None) -> Array:
         """Load shares of the plan under a ZMP that the inputs shift, (num_worlds,) [1]; (0,) for those of the plan."""
         if shift is None:
             return _NO_SHARES
-        shares, spacing = np.empty(len(observed)), self._biped.foot_spacing
-        shifted_shares(observed, self._planned_shares, self._period_s, np.ascontiguousarray(shift), spacing, shares)
+        shares = np.empty(len(observed))
+        shifted_shares(
+            observed,
+            planned=self._planned_shares,
+            period_s=self._period_s,
+            shift=np.ascontiguousarray(shift),
+            spacing=self._foot_spacing,
+            found=shares,
+        )
         return shares
 
 
 _NO_SHARES: Array = np.empty(0)
 
 
-def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> tuple[Any, ...]:
-    """What the kernel needs to know, a row of `CONTROLLER`."""
-    biped, stiffness, period_s = model.biped, model.stiffness.reshape(2, 6), model.control_period_s
-    values = {
-        **gains.model_dump(),
-        "period_s": period_s, "is_com_fed_back": com_feedback,
-        "thigh": biped.leg.thigh, "shank": biped.leg.shank, "footholds": biped.footholds, "omega": model.plan.omega,
-        "weight": biped.weight, "weight_of_feet": biped.weight - biped.chains_above_feet.mass * biped.gravity,
-        "ankle_stiffness": stiffness[:, 4:],
-        "friction_deflection": model.coulomb_friction.reshape(2, 6) / stiffness,
-        "velocity_share": _share(period_s, gains.velocity_filter_s),
-        "zmp_share": _share(period_s, gains.zmp_filter_s),
-        "following_share": following_share(model.plan.omega, period_s),
-        "per_pelvis": center_of_mass_per_pelvis(model),
-        "weight_share": 0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s),
-    }  # fmt: skip
-    return tuple(values[name] for name in kernels.CONTROLLER.names or ())
+def _constants(model: WalkerModel, com_feedback: bool, gains: WalkingGains) -> Any:
+    """Row of `CONTROLLER` for the kernel, (1,)."""
+    biped = model.biped
+    stiffness = model.stiffness.reshape(2, 6)
+    period_s = model.control_period_s
+    constants: Any = np.zeros(1, CONTROLLER)
+    for name in set(WalkingGains.model_fields) & set(CONTROLLER.names or ()):
+        constants[name] = getattr(gains, name)
+    constants["period_s"] = period_s
+    constants["is_com_fed_back"] = com_feedback
+    constants["thigh"] = biped.leg.thigh
+    constants["shank"] = biped.leg.shank
+    constants["footholds"] = biped.footholds
+    constants["weight"] = biped.weight
+    constants["weight_of_feet"] = biped.weight - biped.chains_above_feet.mass * biped.gravity
+    constants["omega"] = model.plan.omega
+    constants["following_share"] = following_share(model.plan.omega, period_s)
+    constants["per_pelvis"] = center_of_mass_per_pelvis(model)
+    constants["ankle_stiffness"] = stiffness[:, 4:]
+    constants["friction_deflection"] = model.coulomb_friction.reshape(2, 6) / stiffness
+    constants["velocity_share"] = _share(period_s, gains.velocity_filter_s)
+    constants["zmp_share"] = _share(period_s, gains.zmp_filter_s)
+    constants["weight_share"] = 0.0 if gains.weight_filter_s is None else _share(period_s, gains.weight_filter_s)
+    return constants
 
 
 def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
     """Inputs as rows of `INPUTS`, (num_worlds,)."""
-    if inputs.is_empty:
+    if inputs is NO_INPUTS or inputs is ONE_WORLD:
         return _none(num_worlds)
-    dense = np.zeros(num_worlds, kernels.INPUTS)
+    dense = np.zeros(num_worlds, INPUTS)
     if inputs.zmp is not None:
         dense["zmp"] = inputs.zmp
     if inputs.com is not None:
@@ -214,10 +288,174 @@ def _dense(inputs: PolicyInputs, num_worlds: int) -> Records:
 
 @lru_cache
 def _none(num_worlds: int) -> Records:
-    """No inputs, which kernels do not change."""
-    return np.zeros(num_worlds, kernels.INPUTS)
+    """No inputs, which the kernel does not change."""
+    return np.zeros(num_worlds, INPUTS)
 
 
 def _share(period_s: float, time_constant_s: float) -> float:
     """Share of a step that a first-order filter makes in one period."""
     return 1.0 - float(np.exp(-period_s / time_constant_s))
+
+
+@compiled
+def control(
+    controller: Any,
+    plan: Any,
+    ramp: Array,
+    observed: Any,
+    com: Array,
+    soles: Array,
+    shares: Array,
+    inputs: Any,
+    before: Any,
+    now: Any,
+    coming: IntArray,
+    pelvis: Array,
+    action: Array,
+) -> bool:
+    """Offsets of the joints, and the memory after a control step; whether the pelvis is shifted.
+
+    Args:
+        controller: Row of `CONTROLLER`, (1,).
+        plan: Rows of `PLAN`, one per control step.
+        ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
+        observed: Observations, rows with fields, (n,).
+        com: Center of mass in a level frame, (n, 3) [m].
+        soles: Middles of the soles in the same, (n, 2, 3) [m].
+        shares: Load shares of the right foot, (n,), or none to take those of the plan, (0,).
+        inputs: Rows of `INPUTS`, (n,).
+        before: Rows of `MEMORY`, (n,).
+        now: The same after the control step, to be filled.
+        coming: Rows of the plan at the end of the control period, to be filled, (n,).
+        pelvis: Shift of the planned pelvis, to be filled, (n, 2) [m].
+        action: To be filled, (n, 12) [rad].
+    """
+    constants = controller[0]
+    is_shifted = False
+    for world in range(len(now)):
+        shown = observed[world]
+        own = now[world]
+        last = before[world]
+        given = inputs[world]
+        row = int(min(max(np.rint(shown.clock[0] / constants.period_s) - 1.0, 0.0), len(plan) - 1.0))
+        coming[world] = min(row + 1, len(plan) - 1)
+        planned = plan[row]
+        own.steps = last.steps + 1.0
+        ramped = ramp[int(min(own.steps, len(ramp) - 1.0))]
+        for i in range(2):
+            own.following[i] = follow_zmp(last.following[i], given.zmp[i], constants.following_share)
+            own.planned[i] = ramped * (own.following[i] + given.com[i])
+            pelvis[world, i] = own.planned[i] / constants.per_pelvis[i]
+            is_shifted = is_shifted or own.planned[i] != 0.0
+        weigh(constants, shown, last, own)
+        share = planned.share if len(shares) == 0 else shares[world]
+        balance_feet(constants, shown, share, given.balance_gain, last, own)
+        for foot in range(2):
+            for i in range(2):
+                own.com[foot, i] = com[world, i] - soles[world, foot, i]
+        follow_com(constants, shown, planned, given.balance_gain, last, own)
+        for leg in range(2):
+            offset_leg(constants, shown, given, own, leg, ramped, action[world])
+    return is_shifted
+
+
+@compiled
+def follow_zmp(center: float, zmp: float, share: float) -> float:
+    """The center of mass a period later, under a ZMP shift that stays as it is; see `baselines.walking.zmp_shift`."""
+    return center + share * (zmp - center)
+
+
+@compiled
+def weigh(controller: Any, shown: Any, last: Any, own: Any) -> None:
+    """The weight as the feet show it, filtered; a share of zero keeps it."""
+    load = (vertical_force(shown, 0) + vertical_force(shown, 1)) + controller.weight_of_feet
+    own.weight = last.weight
+    if controller.weight_share > 0.0:
+        own.weight = last.weight + controller.weight_share * (load - last.weight)
+
+
+@compiled
+def vertical_force(shown: Any, foot: int) -> float:
+    """Along the normal of a sole, which is nearly vertical [N]."""
+    return shown.wrench[foot, 0, 2]
+
+
+@compiled
+def balance_feet(controller: Any, shown: Any, share: float, change: float, last: Any, own: Any) -> None:
+    """Left minus right leg length: what the force difference lacks, integrated with a leak [m]."""
+    gain = (1.0 + change) * controller.force_difference
+    desired = (1.0 - 2.0 * share) * own.weight
+    missing = desired - (vertical_force(shown, 0) - vertical_force(shown, 1))
+    decay = last.difference / controller.force_difference_decay_s
+    difference = last.difference + controller.period_s * (gain * missing - decay)
+    own.difference = within(difference, controller.force_difference_limit_m)
+
+
+@compiled
+def follow_com(controller: Any, shown: Any, planned: Any, change: float, last: Any, own: Any) -> None:
+    """Filtered deviation of the COM velocity from the plan [m/s], and ZMP shift [m]."""
+    support = int(shown.clock[2])
+    for i in range(2):
+        own.velocity[i] = last.velocity[i]
+        own.shift[i] = last.shift[i]
+        if controller.is_com_fed_back:
+            now = own.com[support, i] - own.planned[i]
+            com = last.com[support, i] if last.steps > 0.0 else own.com[support, i]
+            before = com - last.planned[i]
+            deviation = now + controller.footholds[support, i] - planned.com[i]
+            deviating = (now - before) / controller.period_s - planned.com_dot[i]
+            own.velocity[i] = last.velocity[i] + controller.velocity_share * (deviating - last.velocity[i])
+            error = deviation + own.velocity[i] / controller.omega
+            wanted = within((1.0 + change) * controller.dcm * error, controller.zmp_limit_m)
+            own.shift[i] = last.shift[i] + controller.zmp_share * (wanted - last.shift[i])
+
+
+@compiled
+def offset_leg(controller: Any, shown: Any, given: Any, own: Any, leg: int, ramp: float, action: Array) -> None:
+    """Offsets of the joints of a leg: its length, the torque of the ZMP shift, what is added, and friction [rad]."""
+    first = 6 * leg
+    sign = 1.0 - 2.0 * leg
+    difference = own.difference + given.leg_length
+    hip, knee, ankle = lengthening(controller, shown.reference_angle[first + 3], difference, sign)
+    share = shown.load_share if leg == 1 else 1.0 - shown.load_share
+    carried = share * controller.weight
+    pitch = carried * own.shift[0] / controller.ankle_stiffness[leg, 0]
+    roll = -carried * own.shift[1] / controller.ankle_stiffness[leg, 1]
+    for i in range(6):
+        wound = 1.0 + given.deflection[leg, i]
+        moved = 0.0
+        if i == 1:
+            moved = given.hip[leg, 0]
+        elif i == 2:
+            moved = hip + given.hip[leg, 1]
+        elif i == 3:
+            moved = knee
+        elif i == 4:
+            moved = ankle + wound * pitch
+        elif i == 5:
+            moved = wound * roll
+        rate = shown.reference_rate[first + i] / controller.friction_rate_rad_s
+        against_friction = wound * (controller.friction_deflection[leg, i] * math.tanh(rate))
+        action[first + i] = ramp * moved + against_friction
+
+
+@compiled
+def lengthening(controller: Any, knee: float, difference: float, sign: float) -> tuple[float, float, float]:
+    """Offsets of hip pitch, knee and ankle pitch that lengthen a leg by half of a difference, or shorten it [rad].
+
+    The ankle stays on the line from the hip, and the sole keeps its attitude.
+    """
+    thigh = controller.thigh
+    shank = controller.shank
+    distance = math.sqrt(thigh**2 + shank**2 + 2.0 * thigh * shank * math.cos(knee))
+    bend = -distance / (thigh * shank * math.sin(knee)) * (0.5 * sign * difference)
+    at_hip = -bend * shank * (shank + thigh * math.cos(knee)) / distance**2
+    return at_hip, bend, -bend - at_hip
+
+
+@compiled
+def within(value: float, limit: float) -> float:
+    """A value within ±limit; what is no number stays so."""
+    if value > limit:
+        return limit
+    return -limit if value < -limit else value

@@ -22,15 +22,16 @@ Other than published: 250 Hz instead of 125 Hz. In double support horizontal for
 foot out of reach comes as near as the leg allows. The joint angles have no further feedback.
 """
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.policy import Action, ObservationView, taken_up
+from baselines.compensation.policy import BatchPolicy, PolicyInputs
 from baselines.compensation.startup import Ramp
 from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity
-from elastic_env.core.signals import Array
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.contact_force import shares
 from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt
 from elastic_env.motion.trajectory import STAND_S
@@ -52,10 +53,22 @@ class FootBalanceGains(Model):
     turn_limit_rad: float = quantity("rad", np.deg2rad(15.0), gt=0, description="largest turn of a foot about an axis")
 
 
-class FootBalance:
-    """Commands a walker around its plan by adjusting the feet, see the module.
+class BalanceMemory(NamedTuple):
+    """Memory of the balance by the feet.
 
-    Memory per world: steps, filtered roll and pitch, their rates, and the wrenches of both feet.
+    Attributes:
+        steps: Control steps since the start of the episode, (num_worlds, 1).
+        imu: Filtered roll and pitch [rad] and their rates [rad/s], (num_worlds, 4).
+        wrench: Filtered wrenches of both feet, (num_worlds, 12).
+    """
+
+    steps: IntArray
+    imu: Array
+    wrench: Array
+
+
+class FootBalance(BatchPolicy):
+    """Commands a walker around its plan by adjusting the feet, see the module.
 
     Args:
         model: Assumed walker.
@@ -64,42 +77,38 @@ class FootBalance:
     """
 
     def __init__(self, model: WalkerModel, gains: FootBalanceGains | None = None, ramp_s: float = STAND_S) -> None:
-        self._gains, self._biped, self._plan = gains or FootBalanceGains(), model.biped, model.plan
-        table, self._dt = model.observation_table, model.control_period_s
-        self._view, self._ramp = ObservationView(table, self._dt), Ramp(model, ramp_s)
-        self._attitude, self._rate = table.group("imu_attitude"), table.columns("imu_rate.x", "imu_rate.y")
-        self._wrench, self._clock = table.group("wrench"), table.group("clock")
+        table = model.observation_table
+        super().__init__(table, model.control_period_s)
+        self._gains = gains or FootBalanceGains()
+        self._biped = model.biped
+        self._plan = model.plan
+        self._dt = model.control_period_s
+        self._ramp = Ramp(model, ramp_s).table
+        self._attitude = table.group("imu_attitude")
+        self._rate = table.columns("imu_rate.x", "imu_rate.y")
+        self._wrench = table.group("wrench")
+        self._clock = table.group("clock")
         acceleration, _ = derivatives(self._plan.com_dot, self._dt)
         wanted = np.hstack([acceleration / self._biped.gravity, np.ones((len(acceleration), 1))])
         self._wanted = self._biped.weight * shares(self._plan.share)[..., None] * wanted[:, None]  # (T, 2, 3)
 
-    def predict(
-        self,
-        observation: Array,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,  # noqa: ARG002  the interface's
-    ) -> tuple[Action, Any]:
-        """Offsets of the twelve joints [rad], and new state."""
-        rows, gains = self._view.rows(observation), self._gains
-        imu, wrench = np.hstack([rows[:, self._attitude], rows[:, self._rate]]), rows[:, self._wrench]
-        memory, _ = taken_up(
-            state, episode_start, rows, self._view, lambda: np.hstack([np.zeros((len(rows), 1)), imu, wrench])
-        )
-        steps, old_imu, old_wrench = np.split(memory, [1, 5], axis=1)
-        steps = steps + 1.0
-        imu = old_imu + self._share(gains.imu_cutoff_hz) * (imu - old_imu)
-        wrench = old_wrench + self._share(gains.wrench_cutoff_hz) * (wrench - old_wrench)
-        q_ref = self._view.motion(rows).q
-        shift, turn = self._adjustments(rows, imu, wrench)
-        action = self._ramp.after(steps) * (self._moved(q_ref, shift, turn) - q_ref)
-        kept = np.hstack([steps, imu, wrench])
-        return action.astype(np.float32).reshape((*observation.shape[:-1], 12)), (kept, None)
+    @override
+    def begin(self, rows: Array) -> BalanceMemory:
+        return BalanceMemory(np.zeros((len(rows), 1), dtype=np.int64), self._imu(rows), rows[:, self._wrench].copy())
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:  # noqa: ARG002  the interface's
-        """The encoder angles, (..., 12) [rad]: motors are taken for links."""
-        rows = self._view.rows(observation)
-        return self._view.theta(rows).reshape((*observation.shape[:-1], -1))
+    @override
+    def act(self, rows: Array, memory: BalanceMemory, inputs: PolicyInputs) -> tuple[Array, BalanceMemory]:
+        steps = memory.steps + 1
+        imu = memory.imu + self._share(self._gains.imu_cutoff_hz) * (self._imu(rows) - memory.imu)
+        wrench_share = self._share(self._gains.wrench_cutoff_hz)
+        wrench = memory.wrench + wrench_share * (rows[:, self._wrench] - memory.wrench)
+        q_ref = self.view.motion(rows).q
+        shift, turn = self._adjustments(rows, imu, wrench)
+        action = self._ramp.take(steps, mode="clip") * (self._move_feet(q_ref, shift, turn) - q_ref)
+        return action.astype(np.float32), BalanceMemory(steps, imu, wrench)
+
+    def _imu(self, rows: Array) -> Array:
+        return np.hstack([rows[:, self._attitude], rows[:, self._rate]])
 
     def _adjustments(self, rows: Array, imu: Array, wrench: Array) -> tuple[Array, Array]:
         """Shifts of the feet, (num_worlds, 2, 3) [m], and turns about x and y, (num_worlds, 2, 2) [rad]."""
@@ -118,9 +127,10 @@ class FootBalance:
             np.clip(turn, -gains.turn_limit_rad, gains.turn_limit_rad),
         )
 
-    def _moved(self, q: Array, shift: Array, turn: Array) -> Array:
+    def _move_feet(self, q: Array, shift: Array, turn: Array) -> Array:
         """Joint angles with the soles shifted and turned about their middles, (num_worlds, 12) [rad]."""
-        leg, up = self._biped.leg, self._biped.ankle_height
+        leg = self._biped.leg
+        up = self._biped.ankle_height
         position, R = foot_pose(leg, q.reshape(-1, 2, 6))
         turned = rotation_of_tilt(turn) @ R
         ankle = position + shift + up * (turned[..., 2] - R[..., 2])

@@ -16,13 +16,13 @@ Source: loco-3d/sot-talos-balance, src/hip-flexibility-compensation.cpp (method)
 talos/hip_flexibility_compensation_conf.py (1 Hz, 0.01 rad, 0.003 rad/s); create_entities_utils.py (torque sensors).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
 from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
-from baselines.compensation.policy import Action, ObservationView, Policy, PolicyAround, predicted, taken_up
+from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import WalkerModel
@@ -37,24 +37,36 @@ class HipTorqueGains(Model):
     limit_rad: float = quantity("rad", 0.01, gt=0, description="largest offset")
     rate_rad_s: float = quantity("rad/s", 0.003, gt=0, description="largest rate of the offset")
     in_double_support: bool = False
-    """Whether it also acts in double support, as where the published entity has no phase connected."""
+    """It also acts in double support, as where the published entity has no phase connected."""
 
 
-def filtered(before: Array, value: Array, cutoff_hz: float, period_s: float) -> Array:
+def low_pass(before: Array, value: Array, cutoff_hz: float, period_s: float) -> Array:
     """A first-order low-pass after one more sample, elementwise."""
     decay = np.exp(-2.0 * np.pi * cutoff_hz * period_s)
     return decay * before + (1.0 - decay) * value
 
 
-def limited_in_rate(before: Array, value: Array, rate: float, period_s: float) -> Array:
+def limit_rate(before: Array, value: Array, rate: float, period_s: float) -> Array:
     """The value, or as near to it as a rate [1/s] allows after one period, elementwise."""
     return before + np.clip(value - before, -rate * period_s, rate * period_s)
 
 
+class HipTorqueMemory(NamedTuple):
+    """Memory of the hip rolls that are led by their torque.
+
+    Attributes:
+        torque: Filtered torques of both hip rolls, (num_worlds, 2) [N·m].
+        offset: Their offsets, (num_worlds, 2) [rad].
+        inner: Memory of the policy.
+    """
+
+    torque: Array
+    offset: Array
+    inner: Any
+
+
 class HipTorque(PolicyAround):
     """Any policy of a walker with its hip rolls led by their measured torque, see the module.
-
-    Memory per world: filtered torques and offsets of the two hip rolls.
 
     Args:
         policy: What commands the robot.
@@ -66,34 +78,31 @@ class HipTorque(PolicyAround):
     """
 
     def __init__(self, policy: Policy, model: WalkerModel, gains: HipTorqueGains | None = None) -> None:
-        self._policy, self._gains = policy, gains or HipTorqueGains()
-        table, self._dt = model.observation_table, model.control_period_s
+        table = model.observation_table
+        super().__init__(policy, table, model.control_period_s)
         require_sensor(table, TORQUE_SENSOR)
-        self._view, self._clock = ObservationView(table, self._dt), table.group("clock")
+        self._gains = gains or HipTorqueGains()
+        self._dt = model.control_period_s
+        self._clock = table.group("clock")
         self._torque = table.group(TORQUE_SENSOR)
         self._stiffness = model.stiffness[_HIP_ROLLS]
 
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Action, Any]:
-        """Action and new state; all inputs are passed on."""
-        rows, gains = self._view.rows(observation), self._gains
+    @override
+    def begin(self, rows: Array) -> HipTorqueMemory:
+        torque = rows[:, self._torque][:, _HIP_ROLLS]
+        return HipTorqueMemory(torque, np.zeros_like(torque), self.policy.begin(rows))
+
+    @override
+    def act(self, rows: Array, memory: HipTorqueMemory, inputs: PolicyInputs) -> tuple[Array, HipTorqueMemory]:
+        gains = self._gains
+        action, inner = self.policy.act(rows, memory.inner, inputs)
         measured = rows[:, self._torque][:, _HIP_ROLLS]
-        memory, inner = taken_up(
-            state, episode_start, rows, self._view, lambda: np.hstack([measured, np.zeros_like(measured)])
-        )
-        action, inner = predicted(self._policy, observation, inputs, inner, episode_start, deterministic)
-        torque = filtered(memory[:, :2], measured, gains.cutoff_hz, self._dt)
+        torque = low_pass(memory.torque, measured, gains.cutoff_hz, self._dt)
         wanted = np.clip(torque / self._stiffness, -gains.limit_rad, gains.limit_rad)
         if not gains.in_double_support:
             swing = rows[:, self._clock][:, [1]]
             wanted = np.where((swing > 0.0) & (swing < 1.0), wanted, 0.0)
-        offset = limited_in_rate(memory[:, 2:], wanted, gains.rate_rad_s, self._dt)
-        total = np.array(action, dtype=np.float64)
-        total[..., _HIP_ROLLS] += offset.reshape((*total.shape[:-1], 2))
-        return total.astype(np.float32), (np.hstack([torque, offset]), inner)
+        offset = limit_rate(memory.offset, wanted, gains.rate_rad_s, self._dt)
+        total = action.astype(np.float64)
+        total[:, _HIP_ROLLS] += offset
+        return total.astype(np.float32), HipTorqueMemory(torque, offset, inner)

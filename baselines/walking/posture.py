@@ -15,21 +15,22 @@ of this one [Kajita2010, section V].
 [Kajita2010] S. Kajita et al., "Biped Walking Stabilization Based on Linear Inverted Pendulum Tracking", IROS.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.observed import ObservedWalk
-from baselines.compensation.policy import Action, ObservationView, PolicyAround, predicted, taken_up
+from baselines.compensation.policy import PolicyAround, PolicyInputs, Records, WalkView
 from baselines.compensation.startup import Ramp
-from baselines.walking.walking_kernels import POSTURE, POSTURE_MEMORY, hold_posture
+from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.runtime.robot_model import WalkerModel
 
-_HIP_ROLL, _HIP_PITCH = 1, 2  # of six joints of a leg
+# of six joints of a leg
+_HIP_ROLL = 1
+_HIP_PITCH = 2
 
 
 class PostureGains(Model):
@@ -46,10 +47,37 @@ class PostureGains(Model):
     limit_rad: float = quantity("rad", 0.08, gt=0, description="largest part of the integral, and of the whole")
 
 
+POSTURE = record_type(
+    period_s=(),
+    proportional=(),  # [1]
+    integral=(),  # [1/s]
+    derivative=(),  # [s]
+    leak_s=(),
+    limit_rad=(),
+    integral_limit=(),  # [rad·s]
+    filter_share=(),  # of a step in a period [1]
+    swing_share=(),  # likewise
+)
+"""Gains of the posture feedback."""
+
+FEEDBACK = record_type(
+    steps=(),
+    tilt=(2,),  # filtered roll and pitch [rad]
+    integral=(2,),  # of them [rad·s]
+    kept=(2,),  # hip pitch that either leg keeps [rad]
+)
+"""Memory of the posture feedback."""
+
+
+class PostureMemory(NamedTuple):
+    """Memory of a policy with posture feedback: rows of `FEEDBACK`, and that of the policy."""
+
+    feedback: Records
+    inner: Any
+
+
 class PostureFeedback(PolicyAround):
     """Any policy of a walker with its posture held by the hips, see the module.
-
-    Memory per world: steps, filtered roll and pitch, their integrals, and the hip pitch that either leg keeps.
 
     Args:
         policy: What commands the robot.
@@ -61,47 +89,48 @@ class PostureFeedback(PolicyAround):
     def __init__(
         self, policy: Any, model: WalkerModel, gains: PostureGains | None = None, ramp_s: float = STAND_S
     ) -> None:
-        self._policy, gains, period_s = policy, gains or PostureGains(), model.control_period_s
-        self._view, self._observed = (
-            ObservationView(model.observation_table, period_s),
-            ObservedWalk(model.observation_table),
-        )
-        self._ramp = Ramp(model, ramp_s)
-        values = {
-            **gains.model_dump(),
-            "period_s": period_s,
-            "integral_limit": gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf,
-            "filter_share": 1.0 - float(np.exp(-period_s / gains.filter_s)),
-            "swing_share": period_s / max(gains.swing_s, period_s),
-        }
-        self._gains: Any = np.array([tuple(values[name] for name in POSTURE.names or ())], POSTURE)
+        super().__init__(policy, model.observation_table, model.control_period_s)
+        self._walk_view = WalkView(model.observation_table)
+        self._ramp = Ramp(model, ramp_s).table
+        gains = gains or PostureGains()
+        period_s = model.control_period_s
+        self._gains: Any = np.zeros(1, POSTURE)
+        for name in ("proportional", "integral", "derivative", "leak_s", "limit_rad"):
+            self._gains[name] = getattr(gains, name)
+        self._gains["period_s"] = period_s
+        self._gains["integral_limit"] = gains.limit_rad / gains.integral if gains.integral > 0.0 else np.inf
+        self._gains["filter_share"] = 1.0 - float(np.exp(-period_s / gains.filter_s))
+        self._gains["swing_share"] = period_s / max(gains.swing_s, period_s)
 
     @property
+    @override
     def inputs(self) -> tuple[str, ...]:
-        """See `PolicyWithInputs`."""
-        return (*super().inputs, "posture_gain")
+        return (*self.policy.inputs, "posture_gain")
 
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Action, Any]:
-        """See `PolicyWithInputs`; it takes `posture_gain`."""
-        rows = self._view.rows(observation)
-        memory, inner = taken_up(
-            state, episode_start, rows, self._view, lambda: np.zeros((len(rows), POSTURE_MEMORY.itemsize // 8))
+    @override
+    def begin(self, rows: Array) -> PostureMemory:
+        return PostureMemory(np.zeros(len(rows), FEEDBACK), self.policy.begin(rows))
+
+    @override
+    def act(self, rows: Array, memory: PostureMemory, inputs: PolicyInputs) -> tuple[Array, PostureMemory]:
+        """It takes the input `posture_gain`."""
+        change = _NO_CHANGE
+        if inputs.posture_gain is not None:
+            change = np.ascontiguousarray(inputs.posture_gain)
+            inputs = inputs._replace(posture_gain=None)
+        action, inner = self.policy.act(rows, memory.inner, inputs)
+        total = action.astype(np.float64)
+        feedback = np.empty(len(rows), FEEDBACK)
+        hold_posture(
+            gains=self._gains,
+            observed=self._walk_view.fields(rows),
+            ramp=self._ramp,
+            change=change,
+            before=memory.feedback,
+            now=feedback,
+            action=total,
         )
-        others = inputs if inputs.posture_gain is None else inputs._replace(posture_gain=None)
-        action, inner = predicted(self._policy, observation, others, inner, episode_start, deterministic)
-        total, kept = np.array(action, dtype=np.float64, ndmin=2), np.empty(memory.shape)
-        change = _NO_CHANGE if inputs.posture_gain is None else np.ascontiguousarray(inputs.posture_gain)
-        before = np.ndarray(len(rows), POSTURE_MEMORY, np.ascontiguousarray(memory))
-        now = np.ndarray(len(rows), POSTURE_MEMORY, kept)
-        hold_posture(self._gains, self._observed.fields(rows), self._ramp.table, change, (before, now), total)
-        return total.astype(np.float32).reshape(np.shape(action)), (kept, inner)
+        return total.astype(np.float32), PostureMemory(feedback, inner)
 
 
 _NO_CHANGE: Array = np.empty((0, 1))
@@ -116,5 +145,59 @@ def hip_offsets(turn: Array) -> Array:
     """
     offsets = np.zeros((len(turn), 2, 6))
     of_legs = turn if turn.ndim == 3 else turn[:, None]
-    offsets[:, :, _HIP_ROLL], offsets[:, :, _HIP_PITCH] = of_legs[..., 0], of_legs[..., 1]
+    offsets[:, :, _HIP_ROLL] = of_legs[..., 0]
+    offsets[:, :, _HIP_PITCH] = of_legs[..., 1]
     return offsets.reshape(len(turn), 12)
+
+
+@compiled
+def hold_posture(gains: Any, observed: Any, ramp: Array, change: Array, before: Any, now: Any, action: Array) -> None:
+    """Add the turn of the hips against the pelvis' tilt, and keep the memory after a control step.
+
+    Args:
+        gains: Row of `POSTURE`, (1,).
+        observed: Observations, rows with fields.
+        ramp: Share of the feedback after 0, 1, ... control steps, up to the last one [1].
+        change: Relative change of all gains, (n, 1) [1], or none, (0, 1); the integral itself goes on as it is.
+        before: Rows of `FEEDBACK`, (n,).
+        now: The same after the control step, to be filled.
+        action: Offsets of the joints, (n, 12) [rad].
+    """
+    own = gains[0]
+    for world in range(len(action)):
+        shown = observed[world]
+        last = before[world]
+        kept = now[world]
+        kept.steps = last.steps + 1.0
+        share = ramp[int(min(kept.steps, len(ramp) - 1.0))]
+        further = change[world, 0] if len(change) > 0 else 0.0
+        for i in range(2):
+            tilt = last.tilt[i] + own.filter_share * (shown.imu_attitude[i] - last.tilt[i])
+            integral = last.integral[i] + own.period_s * (tilt - last.integral[i] / own.leak_s)
+            kept.tilt[i] = tilt
+            kept.integral[i] = within(integral, own.integral_limit)
+            turn = own.proportional * tilt + own.integral * kept.integral[i] + own.derivative * shown.imu_rate[i]
+            turn = share * within((1.0 + further) * turn, own.limit_rad)
+            for leg in range(2):
+                if i == 0:
+                    action[world, 6 * leg + 1] += turn
+                else:
+                    action[world, 6 * leg + 2] += pitch_of_leg(own, shown.load_share, leg, turn, last, kept)
+
+
+@compiled
+def pitch_of_leg(own: Any, share_right: float, leg: int, turn: float, last: Any, kept: Any) -> float:
+    """Hip pitch of a leg [rad]: one that carries half of the weight stands and turns, one in the air follows slowly."""
+    share = share_right if leg == 1 else 1.0 - share_right
+    standing = min(2.0 * share, 1.0)
+    following = own.swing_share if standing < 1.0 else 1.0
+    kept.kept[leg] = last.kept[leg] + following * (turn - last.kept[leg])
+    return last.kept[leg] + standing * (turn - last.kept[leg])
+
+
+@compiled
+def within(value: float, limit: float) -> float:
+    """A value within ±limit; what is no number stays so."""
+    if value > limit:
+        return limit
+    return -limit if value < -limit else value

@@ -18,8 +18,9 @@ thormang3_foot_step_generator/data/balance_param.yaml; the later thormang3_demo/
 from typing import Any
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.policy import Action, ObservationView, Policy
+from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import RIGHT
@@ -54,7 +55,7 @@ def stance_roll(swing: Array, support: Array, gains: StanceRollGains) -> Array:
     return offsets.reshape(len(swing), 12)
 
 
-class StanceRoll:
+class StanceRoll(PolicyAround):
     """Any policy of a walker with the hip roll feedforward added, see the module; it has no memory of its own.
 
     Args:
@@ -64,19 +65,20 @@ class StanceRoll:
     """
 
     def __init__(self, policy: Policy, model: WalkerModel, gains: StanceRollGains | None = None) -> None:
-        self._policy, self._gains = policy, gains or StanceRollGains()
-        self._view = ObservationView(model.observation_table, model.control_period_s)
+        super().__init__(policy, model.observation_table, model.control_period_s)
+        self._gains = gains or StanceRollGains()
         self._clock = model.observation_table.group("clock")
 
-    def predict(
-        self, observation: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Action, Any]:
-        """Action and new state."""
-        _, swing, support = self._view.rows(observation)[:, self._clock].T
-        action, state = self._policy.predict(observation, state, episode_start, deterministic)
-        added = stance_roll(swing, support, self._gains).reshape(np.shape(action))
-        return (np.asarray(action, dtype=np.float64) + added).astype(np.float32), state
+    @override
+    def begin(self, rows: Array) -> Any:
+        return self.policy.begin(rows)
 
-    def link_estimate(self, observation: Array, state: Any) -> Array:
-        """Link angles that the policy saw, (..., 12) [rad]."""
-        return self._policy.link_estimate(observation, state)  # pyright: ignore[reportAttributeAccessIssue]
+    @override
+    def act(self, rows: Array, memory: Any, inputs: PolicyInputs) -> tuple[Array, Any]:
+        _, swing, support = rows[:, self._clock].T
+        action, memory = self.policy.act(rows, memory, inputs)
+        return (action + stance_roll(swing, support, self._gains)).astype(np.float32), memory
+
+    @override
+    def link_angles(self, rows: Array, memory: Any) -> Array:
+        return self.policy.link_angles(rows, memory)

@@ -11,12 +11,12 @@ flat on their footholds. T is several steps long: within a step the ZMP is the c
 ZMP against the feet, so feet that have drifted from their footholds are not seen.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from typing_extensions import override
 
-from baselines.compensation.inputs import PolicyInputs
-from baselines.compensation.policy import Action, ObservationView, PolicyAround, predicted, taken_up
+from baselines.compensation.policy import PolicyAround, PolicyInputs
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.runtime.robot_model import WalkerModel
@@ -32,10 +32,15 @@ class ZmpOffsetGains(Model):
     limit_m: float = quantity("m", 0.03, gt=0, lt=0.05, description="largest shift forward and sideways")
 
 
+class ZmpOffsetMemory(NamedTuple):
+    """The shift of the ZMP forward and to the left, (num_worlds, 2) [m], and the memory of the policy."""
+
+    shift: Array
+    inner: Any
+
+
 class ZmpOffset(PolicyAround):
     """A policy of a walker with its planned ZMP shifted against the mean error, see the module.
-
-    Memory per world: the shift forward and to the left [m].
 
     Args:
         policy: What commands the robot; it has the input `zmp`.
@@ -44,27 +49,26 @@ class ZmpOffset(PolicyAround):
     """
 
     def __init__(self, policy: Any, model: WalkerModel, gains: ZmpOffsetGains | None = None) -> None:
-        self._policy, self._biped, gains = policy, model.biped, gains or ZmpOffsetGains()
         table = model.observation_table
-        self._view = ObservationView(table, model.control_period_s)
-        self._wrench, self._zmp = table.group("wrench"), table.group("zmp_reference")
+        super().__init__(policy, table, model.control_period_s)
+        gains = gains or ZmpOffsetGains()
+        self._biped = model.biped
+        self._wrench = table.group("wrench")
+        self._zmp = table.group("zmp_reference")
         self._least_n = _LEAST_LOAD * model.biped.weight
-        self._rate, self._limit = model.control_period_s / gains.time_constant_s, gains.limit_m
+        self._rate = model.control_period_s / gains.time_constant_s
+        self._limit = gains.limit_m
 
-    def predict_with(
-        self,
-        observation: Array,
-        inputs: PolicyInputs,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[Action, Any]:
-        """See `PolicyWithInputs`; its shift adds to the input `zmp`."""
-        rows = self._view.rows(observation)
-        shift, inner = taken_up(state, episode_start, rows, self._view, lambda: np.zeros((len(rows), 2)))
+    @override
+    def begin(self, rows: Array) -> ZmpOffsetMemory:
+        return ZmpOffsetMemory(np.zeros((len(rows), 2)), self.policy.begin(rows))
+
+    @override
+    def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> tuple[Array, ZmpOffsetMemory]:
+        """Its shift adds to the input `zmp`."""
         measured = self._biped.zmp_on_footholds(rows[:, self._wrench], self._least_n)
         error = np.nan_to_num(measured - rows[:, self._zmp], nan=0.0)
-        shift = np.clip(shift - self._rate * error, -self._limit, self._limit)
-        moved = inputs._replace(zmp=shift if inputs.zmp is None else inputs.zmp + shift)
-        action, inner = predicted(self._policy, observation, moved, inner, episode_start, deterministic)
-        return action, (shift, inner)
+        shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
+        zmp = shift if inputs.zmp is None else inputs.zmp + shift
+        action, inner = self.policy.act(rows, memory.inner, inputs._replace(zmp=zmp))
+        return action, ZmpOffsetMemory(shift, inner)

@@ -19,13 +19,14 @@ and while p changes, the ZMP is shifted by p − ṗ/ω: it comes late by 1/ω, 
 Stabilization", ICRA.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
 
-from baselines.walking import walking_kernels as kernels
-from elastic_env.core.signals import Array
+from elastic_env.core.compiled import compiled, record_type
+from elastic_env.core.signals import Array, IntArray
 from elastic_env.dynamics.leg_kinematics import LegGeometry
 from elastic_env.runtime.robot_model import WalkerModel
 
@@ -66,15 +67,33 @@ def center_of_mass_per_pelvis(model: WalkerModel) -> Array:
 
     The legs follow the pelvis by half on average: it is the share of the weight that the pelvis carries along.
     """
-    plan, biped, axes = model.plan, model.biped, np.eye(3)[:2]
+    plan = model.plan
+    biped = model.biped
+    axes = np.eye(3)[:2]
     moved = plan.pelvis[0] + _PROBE_M * np.concatenate([axes, -axes])
     q = biped.joint_angles(moved, np.broadcast_to(plan.ankles[0], (4, 2, 3)))
     com = moved + biped.chains.center_of_mass(q.reshape(4, 2, -1))
     return np.diagonal((com[:2] - com[2:])[:, :2] / (2.0 * _PROBE_M)).copy()
 
 
+LEGS = record_type(
+    thigh=(),  # [m]
+    shank=(),  # [m]
+    reach=(),  # to which ankles come from their hips [m]
+    hips=(2, 3),  # [m]
+)
+"""The legs, to move the pelvis over feet that stay."""
+
+STANCE = record_type(
+    pelvis=(3,),  # [m]
+    ankles=(2, 3),  # [m]
+    q=(2, 6),  # [rad]
+)
+"""Pelvis, ankles and joint angles of the plan, one row per control step."""
+
+
 class Stances(NamedTuple):
-    """What moves the planned pelvis over feet that stay: a row of `LEGS` and rows of `STANCE` of the kernels."""
+    """The legs, a row of `LEGS`, and the planned stances, rows of `STANCE`, over which the pelvis is moved."""
 
     legs: Any
     rows: Any
@@ -82,10 +101,13 @@ class Stances(NamedTuple):
     @classmethod
     def of(cls, model: WalkerModel) -> "Stances":
         """Those of the assumed walker and its plan."""
-        plan, leg, size = model.plan, model.biped.leg, len(model.plan.q)
-        legs = np.array([(leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)], kernels.LEGS)
-        rows = np.zeros(size, kernels.STANCE)
-        rows["pelvis"], rows["ankles"], rows["q"] = plan.pelvis, plan.ankles, plan.q.reshape(size, 2, -1)
+        plan = model.plan
+        leg = model.biped.leg
+        legs = np.array([(leg.thigh, leg.shank, _REACH * leg.reach, model.biped.hips)], LEGS)
+        rows = np.zeros(len(plan.q), STANCE)
+        rows["pelvis"] = plan.pelvis
+        rows["ankles"] = plan.ankles
+        rows["q"] = plan.q.reshape(-1, 2, 6)
         return cls(legs, rows)
 
 
@@ -105,7 +127,57 @@ def zmp_shift_offsets(model: WalkerModel, zmp: Array) -> Array:
     Returns:
         (T, 12) [rad].
     """
-    stances, offsets = Stances.of(model), np.zeros((len(zmp), len(model.joint_names)))
+    stances = Stances.of(model)
+    offsets = np.zeros((len(zmp), len(model.joint_names)))
     shift = center_of_mass_shift(zmp, model.plan.omega, model.control_period_s)
-    kernels.move_pelvis_in_rows(stances.legs, stances.rows, shift, offsets)
+    move_pelvis(stances.legs, stances.rows, steps=np.arange(len(zmp)), shift=shift, offset=offsets)
     return offsets
+
+
+@compiled
+def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: Array) -> None:
+    """Add the offsets that move the planned pelvis over feet that stay; no shift changes no bit.
+
+    Where a foot would be out of reach, the leg is as long as it can be.
+
+    Args:
+        legs: Row of `LEGS`, (1,).
+        stances: Rows of `STANCE`, one per control step of the plan.
+        steps: Row of the plan for each of the shifts, (n,).
+        shift: Forward and to the left, (n, 2) [m].
+        offset: To be added to, (n, 12) [rad].
+    """
+    leg = legs[0]
+    for row in range(len(shift)):
+        if shift[row, 0] == 0.0 and shift[row, 1] == 0.0:
+            continue
+        stance = stances[steps[row]]
+        for side in range(2):
+            x = stance.ankles[side, 0] - (stance.pelvis[0] + shift[row, 0]) - leg.hips[side, 0]
+            y = stance.ankles[side, 1] - (stance.pelvis[1] + shift[row, 1]) - leg.hips[side, 1]
+            z = stance.ankles[side, 2] - stance.pelvis[2] - leg.hips[side, 2]
+            pulled = min(1.0, leg.reach / math.sqrt(x**2 + y**2 + z**2))
+            roll, pitch, knee = level_leg(leg, pulled * x, pulled * y, pulled * z)
+            first = 6 * side
+            q = stance.q[side]
+            offset[row, first] -= q[0]
+            offset[row, first + 1] += roll - q[1]
+            offset[row, first + 2] += pitch - q[2]
+            offset[row, first + 3] += knee - q[3]
+            offset[row, first + 4] += -(pitch + knee) - q[4]
+            offset[row, first + 5] += -roll - q[5]
+
+
+@compiled
+def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle less hip [m].
+
+    `elastic_env.dynamics.leg_kinematics.leg_angles` has soles of every attitude.
+    """
+    distance = math.sqrt(x**2 + y**2 + z**2)
+    thigh = legs.thigh
+    shank = legs.shank
+    cosine = (distance**2 - thigh**2 - shank**2) / (2.0 * thigh * shank)
+    knee = math.acos(min(max(cosine, -1.0), 1.0))
+    of_shank = math.atan2(thigh * math.sin(knee), shank + thigh * math.cos(knee))  # from the line of hip and ankle
+    return math.atan2(y, -z), of_shank + math.atan2(-x, math.hypot(y, z)) - knee, knee

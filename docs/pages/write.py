@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import baselines
 from docs.pages import arms, joints, speeds, walks
 from docs.pages.cells import KEPT, Cells, Rows, minus, page_table, read_rows, scaled
 from docs.pages.learned import (
@@ -217,6 +218,7 @@ PARTS: Mapping[str, Part] = {
     "speed of vector environments": _of(speeds.vector_environments, "speed_walker", "speed_testbed"),
     "speed of other ways": _of(speeds.other_ways, "speed_walker", "speed_testbed"),
     "costs of cells": _of(speeds.costs_of_cells, "cluster"),
+    "named policies": Part((), lambda _: policy_table()),
     "policies alone": _of_standings(speeds.policies_alone),
     "drawn robots": _of(walks.drawn_robots, "drawn_robots"),
     "errors of the IMU": _of(walks.imu_errors, "walker_imu"),
@@ -289,6 +291,12 @@ def reads(text: str) -> set[str]:
     shown = {name for part, own in PARTS.items() if marks(part)[0] in text for name in own.reads}
     shown |= {name for picture, own in PICTURES.items() if f"images/{picture}" in text for name in own.reads}
     return shown | {place.partition("; ")[0] for place, _ in _FIGURE.findall(text)}
+
+
+def policy_table() -> str:
+    """The table of `baselines.make`."""
+    lines = [line.strip() for line in (baselines.make.__doc__ or "").splitlines()]
+    return "\n".join(line for line in lines if line.startswith("|"))
 
 
 def pages(root: Path) -> list[Path]:

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+import numpy as np
 from numba.core import event as events
 from numba.extending import register_jitable
 
@@ -54,6 +55,16 @@ class _Compilations(events.Listener):
 
 
 events.register("numba:compile", _Compilations())
+
+
+def record_type(**fields: Any) -> np.dtype[Any]:
+    """Type of the rows of a record array for kernels.
+
+    Args:
+        **fields: Shape of each field of numbers, () for a number; bool for a truth value.
+    """
+    parts = [(name, np.bool_) if shape is bool else (name, np.float64, shape) for name, shape in fields.items()]
+    return np.dtype((np.record, parts))
 
 
 def within_compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
