@@ -601,3 +601,73 @@ def test_the_oracle_says_what_an_environment_of_ones_own_lacks() -> None:
     own, _ = of_ones_own(scalar(), first_command=0.0)
     with pytest.raises(ConfigurationError, match=r"by a method truth\(\) of the environment, which SimpleNamespace"):
         baselines.make("oracle", own)
+
+
+class Half(GravityCompensator):
+    """A user's compensator: half of Eq. 9."""
+
+    def offset(self, motion: Any, memory: Array) -> tuple[Array, Array]:
+        offset, memory = super().offset(motion, memory)
+        return 0.5 * offset, memory
+
+
+class Counting:
+    """A compensator of a user that derives from nothing: it leads by a microradian per control step."""
+
+    modelled = 1.0
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+
+    def at(self, rows: Array) -> "Counting":
+        return self
+
+    def begin(self, motion: Any) -> Array:
+        return np.zeros((len(motion.q), 1))
+
+    def offset(self, motion: Any, memory: Array) -> tuple[Array, Array]:
+        return np.full_like(motion.q, 1e-6) * (memory + 1.0), memory + 1.0
+
+    def deflection(self, offset: Array, memory: Array) -> Array:
+        return offset
+
+    def link_angle(self, theta: Array, memory: Array) -> Array:
+        return theta - 0.25
+
+    def link_rate(self, theta: Array, theta_dot: Array) -> Array:
+        return theta_dot
+
+
+@pytest.mark.parametrize("make_env", [scalar, lambda **kw: vector(2, **kw)], ids=["scalar", "vector"])
+def test_compensators_of_users_work(make_env: Any) -> None:
+    """Catches an interface that asks more of a compensator than the docs do, and memory that does not come back."""
+    env = make_env()
+    model = env.unwrapped.assumed_model
+    zero = baselines.make("zero", env)
+    observation, _ = env.reset(seed=0)
+    whole, _ = baselines.make("input", env, **AT_ONCE).predict(observation)
+    half, _ = baselines.Compensated(zero, Half(model), **AT_ONCE).predict(observation)
+    np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-6)
+    counting, state = baselines.Compensated(zero, Counting(model), **AT_ONCE), None
+    for step in range(1, 4):
+        action, state = counting.predict(observation, state)
+        np.testing.assert_allclose(action, 1e-6 * step, rtol=1e-6)
+    theta = observation[..., [column(env, "encoder_angle")]]
+    np.testing.assert_array_equal(counting.link_estimate(observation, state), theta - 0.25)
+
+
+def test_a_policy_of_a_user_is_told_how_it_was_called() -> None:
+    """Catches a flag that gets lost on the way, and an episode start of another world."""
+    env, calls = vector(2), []
+
+    class Listening:
+        def predict(self, rows: Array, state: Any = None, episode_start: Any = None, deterministic: bool = True) -> Any:
+            calls.append((state, np.array(episode_start).tolist(), deterministic))
+            return np.zeros((len(rows), 1)), len(calls)
+
+    policy = baselines.Compensated(Listening(), GravityCompensator(env.unwrapped.assumed_model))
+    observation, _ = env.reset(seed=0)
+    _, state = policy.predict(observation, deterministic=False)
+    _, state = policy.predict(observation, state)
+    policy.predict(observation, state, np.array([False, True]))
+    assert calls == [(None, [True, True], False), (1, [False, False], True), (2, [False, True], True)]

@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from baselines.compensation.policy import BatchPolicy, Policy, PolicyInputs, put_rows, select_rows
 from baselines.residual.correction import Corrected, CorrectedMemory
-from baselines.residual.evidence import EvidenceMemory, caution
+from baselines.residual.evidence import caution
 from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.network import Network, Tensors
 from baselines.residual.settings import ResidualSettings
@@ -115,7 +115,7 @@ class ResidualMemory(NamedTuple):
     wait: IntArray
     residual: Array
     features: FeaturesMemory
-    caution: EvidenceMemory | None
+    caution: Any
     inner: CorrectedMemory
 
 
