@@ -2,8 +2,7 @@
 
     python -m docs.pages.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
 
-Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of
-the robot.
+Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of the robot.
 """
 
 import csv

@@ -54,8 +54,8 @@ CHARTS = (
 def step_svg(rows: Rows) -> str:
     """The picture.
 
-    Args: rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals
-        of the charts.
+    Args:
+        rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals of the charts.
     """
     height = _TOP + len(CHARTS) * (_HEIGHT + _GAP)
     label = "Pelvis error and ZMP deviation over a step of 3 s, without and with compensation"

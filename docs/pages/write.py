@@ -2,10 +2,9 @@
 
     python -m docs.pages          # README.md and docs/*.md from docs/results
 
-A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard:
-end -->`. A figure within a sentence stands between `<!-- = paper; input_output; 3 s; nominal;
-pelvis_roll_rms_rad -->` and `<!-- / -->`. The tool writes all of them anew. A test fails where a
-page and the results disagree.
+A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. A figure
+within a sentence stands between `<!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->` and `<!-- / -->`.
+The tool writes all of them anew. A test fails where a page and the results disagree.
 """
 
 import re
@@ -243,8 +242,10 @@ _FIGURE = re.compile(r"<!-- = (.*?) -->(.*?)<!-- / -->")
 def figure(results: Results, place: str, now: str) -> str:
     """A figure within a sentence, with as many decimals as it has now.
 
-    Args: results: The results. place: Table, policy, reference, scenario, metric, and a statistic
-        where it is not the first one. now: The text between its marks.
+    Args:
+        results: The results.
+        place: Table, policy, reference, scenario, metric, and a statistic where it is not the first one.
+        now: The text between its marks.
 
     Raises:
         ConfigurationError: There is no such figure.
@@ -271,8 +272,8 @@ def has_parts(text: str) -> bool:
 def page_with(text: str, results: Results) -> str:
     """A page with every part and every figure between its marks written anew.
 
-    Raises: ConfigurationError: It has no marks of any part, or not both of a part, each once and in
-        order.
+    Raises:
+        ConfigurationError: It has no marks of any part, or not both of a part, each once and in order.
     """
     parts = [part for part in PARTS if any(mark in text for mark in marks(part))]
     for part in parts or ([] if _FIGURE.search(text) else PARTS):

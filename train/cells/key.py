@@ -30,10 +30,9 @@ _LARGEST_SOURCE = 10_000_000
 def cell_key(condition: Condition) -> str:
     """SHA-256 digest of a condition, of the files that it names, and of the versions of the physics.
 
-    Files are weights of residuals, tables of offsets and stiffness, robots with their models and
-    joints, and Python files of the user's, with those of their folder that they import. They are
-    read and never imported. What such a file reads when it runs is not seen. Labels are text and
-    name no files.
+    Files are weights of residuals, tables of offsets and stiffness, robots with their models and joints, and Python
+    files of the user's, with those of their folder that they import. They are read and never imported. What such a file
+    reads when it runs is not seen. Labels are text and name no files.
     """
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
     named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]

@@ -45,9 +45,8 @@ def run_conditions(
 ) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    The results do not depend on where they are played. On hardware the conditions come one after
-    the other, in this process, at whose terminal somebody can agree to them; nothing is kept of
-    them.
+    The results do not depend on where they are played. On hardware the conditions come one after the other, in this
+    process, at whose terminal somebody can agree to them; nothing is kept of them.
 
     Args:
         conditions: What to play.
@@ -176,8 +175,9 @@ class _Playing:
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     """Conditions, by their numbers, that are played in one vector environment: many worlds cost less each.
 
-    Args: conditions: What to play. cores: Batches that are played at a time. There are twice as
-        many, if there can be: not all last as long.
+    Args:
+        conditions: What to play.
+        cores: Batches that are played at a time. There are twice as many, if there can be: not all last as long.
     """
     worlds = sum(condition.episodes for condition in conditions)
     most = min(worlds // (2 * cores), MOST_WORLDS)

@@ -1,7 +1,6 @@
 """Finished cells on the disk: a file each under the key of its content, written whole or not at all.
 
-A file holds its key and a digest of the rest, and is checked against the condition before anything
-of it is used.
+A file holds its key and a digest of the rest, and is checked against the condition before anything of it is used.
 """
 
 import dataclasses
@@ -79,8 +78,8 @@ class Store:
         Returns:
             Whether it is kept.
 
-        Raises: OSError: The disk is full, or the folder cannot be written; cells that were kept
-            before stay.
+        Raises:
+            OSError: The disk is full, or the folder cannot be written; cells that were kept before stay.
         """
         file = self._file(evaluation.condition)
         if key is not None and file.stem != key:

@@ -1,7 +1,6 @@
 """Paired changes of a comparison: every residual against its base and against the best policy without learning.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first
-policy.
+Every baseline is compared with the base of the residuals, or without residuals with the first policy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,16 +28,16 @@ from train.evaluate.table import EpisodeTable, failures
 
 CEILING = "ceiling on the training condition"
 SAME_ROBOT = "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot
-is that of the training, so that evaluation differs by noise alone."""
+"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot is that of the
+training, so that evaluation differs by noise alone."""
 HELD_OUT = "held out"
 PARTLY = "partly held out"
 """Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
 """What a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds
-every other one misses the truth, over five every eleventh."""
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
+misses the truth, over five every eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any effect."""
 
@@ -59,22 +58,26 @@ Groups = Mapping[str, Sequence[str]]
 class Change:
     """A policy against its base in one metric, in one scenario or pooled over a group of them.
 
-    Attributes: policy, base: Titles. is_family: Whether the policy is a residual, so that it has
-        training seeds. reference: Label of the motion. scope: Scenario, or name of the group.
-        is_group: Whether it is a group. swept: Options that a sweep varies, and their values.
-        marks: What the reader has to know of the row: a ceiling, something held out. column: The
-        metric. is_judged: Whether policies are judged by it; else it stands in tables alone.
-        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
-        baseline one value. relative: Interquartile mean of it over training seeds. improvement:
-        Probability that an episode is better than the base's. mine, theirs: Metric of the policy
-        and of its base over the pairs [SI]; the interquartile mean over training
+    Attributes:
+        policy, base: Titles.
+        is_family: Whether the policy is a residual, so that it has training seeds.
+        reference: Label of the motion.
+        scope: Scenario, or name of the group.
+        is_group: Whether it is a group.
+        swept: Options that a sweep varies, and their values.
+        marks: What the reader has to know of the row: a ceiling, something held out.
+        column: The metric.
+        is_judged: Whether policies are judged by it; else it stands in tables alone.
+        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
+        relative: Interquartile mean of it over training seeds.
+        improvement: Probability that an episode is better than the base's.
+        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile mean over training
             seeds.
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
-        is_rival: Whether `base` is not the base of the residual but the best policy without
-            learning.
+        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
     """
 
     policy: str

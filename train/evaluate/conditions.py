@@ -65,8 +65,8 @@ GivenRanges = Annotated[
     dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)],
     AfterValidator(_ranges),
 ]
-"""Intervals of drawn robots that differ from those of their scenario, by the names of
-`RobotRanges`; or several such mappings, each of an equal share of the robots."""
+"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`; or several such
+mappings, each of an equal share of the robots."""
 
 
 def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
@@ -114,8 +114,8 @@ class Member(Model):
     base: str
     """Title of the policy that it corrects."""
     rival: str | None = None
-    """Title of the best policy without learning and with the standard sensors; None where that is
-    the base, or nobody plays it."""
+    """Title of the best policy without learning and with the standard sensors; None where that is the base, or nobody
+    plays it."""
 
 
 class Condition(Model):
@@ -126,9 +126,8 @@ class Condition(Model):
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
     reference: GivenReference = "hold"
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
-    three durations [s], or a mapping with `step_period` and further arguments of the
-    environment."""
+    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
+    or a mapping with `step_period` and further arguments of the environment."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"

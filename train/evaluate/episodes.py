@@ -31,9 +31,11 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 class Evaluation:
     """What came out of a condition.
 
-    Attributes: condition: The condition. episodes: Flat records, one per episode: seed, metrics,
-        termination. trace: Signals of the first episode over time, those that the environment's
-        description names. points: Static points of the first episode, with reference "hold".
+    Attributes:
+        condition: The condition.
+        episodes: Flat records, one per episode: seed, metrics, termination.
+        trace: Signals of the first episode over time, those that the environment's description names.
+        points: Static points of the first episode, with reference "hold".
         rest_references: References of the static points, (visits,) [rad].
     """
 
@@ -76,12 +78,13 @@ def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT,
 def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
     """Play all episodes of a condition. Episode i has seed + i, whatever the number of worlds and threads.
 
-    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it
-    may play episodes of the robots that it is scored on, under other noise, see
-    `baselines.adaptation.iterative`.
+    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it may play episodes of
+    the robots that it is scored on, under other noise, see `baselines.adaptation.iterative`.
 
-    Args: condition: What to play. progress: Called with the number of control steps done since the
-        last call, of all episodes together. num_threads: Threads of the physics, 0 for all cores.
+    Args:
+        condition: What to play.
+        progress: Called with the number of control steps done since the last call, of all episodes together.
+        num_threads: Threads of the physics, 0 for all cores.
     """
     return evaluate_together([condition], progress, num_threads)[0]
 
@@ -91,8 +94,10 @@ def evaluate_together(
 ) -> list[Evaluation]:
     """Play conditions of one policy side by side, which costs less; their results are those of `evaluate`.
 
-    Args: conditions: What to play: one, or several with the same `shared_settings` that can share
-        worlds. progress: See `evaluate`. num_threads: See `evaluate`.
+    Args:
+        conditions: What to play: one, or several with the same `shared_settings` that can share worlds.
+        progress: See `evaluate`.
+        num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
     episodes = [(result, number) for result in results for number in range(result.condition.episodes)]

@@ -1,7 +1,6 @@
 """Policies of a comparison with all training seeds of a residual, and with whom each residual is compared.
 
-A residual is compared with its base, and with the best policy without learning that reads the same
-sensors.
+A residual is compared with its base, and with the best policy without learning that reads the same sensors.
 """
 
 import difflib
@@ -67,8 +66,8 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
         with_bases: Whether a base or a rival that is not among them is added, before its residual.
 
-    Raises: ConfigurationError: A pattern that matches no folder, a folder without residual, or
-        folders that do not belong
+    Raises:
+        ConfigurationError: A pattern that matches no folder, a folder without residual, or folders that do not belong
             together.
     """
     entrants: list[Entrant] = []
@@ -142,8 +141,8 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
 def _matching(pattern: str) -> list[Path]:
     """Folders whose paths match a pattern.
 
-    Raises: ConfigurationError: The pattern stands for folders of any depth, which may be all of the
-        disk.
+    Raises:
+        ConfigurationError: The pattern stands for folders of any depth, which may be all of the disk.
     """
     if "**" in pattern:
         raise ConfigurationError(f"* stands for one part of a path, got {shown(pattern)}; leave ** out")
@@ -256,9 +255,8 @@ def _beside(
 def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
     """The best policy without learning, with the same sensors, in the same environment; None where that is the base.
 
-    One that is among the policies counts if it assumes the same stiffness, whatever its other
-    options. Where the base is that policy with options, it is compared with the plain one if that
-    is among the policies.
+    One that is among the policies counts if it assumes the same stiffness, whatever its other options. Where the base
+    is that policy with options, it is compared with the plain one if that is among the policies.
     """
     known = ENVIRONMENTS.get(description.robot)
     name = best_analytic(known is not None and known.walks)

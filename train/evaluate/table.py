@@ -18,16 +18,15 @@ from train.evaluate.statistics import Estimate, over_seeds
 class EpisodeTable:
     """All episodes of a comparison.
 
-    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have
-    numbers.
+    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have numbers.
 
     Args:
         evaluations: All cells, one per training seed.
 
-    Attributes: rows: A row per episode, with `policy`, `member` (folder of a training seed; empty
-        of a policy
-            that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the
-            metrics [SI], nan where the episode failed.
+    Attributes:
+        rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a policy
+            that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the metrics
+            [SI], nan where the episode failed.
         cells: Number of every cell, by `Condition.cell`.
         conditions: The first condition of every policy and cell.
         members: Training seeds of every residual, by title and folder.

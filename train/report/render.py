@@ -51,8 +51,10 @@ _WORD = re.compile(r"\S+(?: [^\w\s]+)*")
 class Part:
     """A piece of a cell.
 
-    Attributes: text: Plain text. style: Look of it: bold; small, on a line below; a failure; a
-        badge; or the colour of a verdict. before: Plain text between it and the part before.
+    Attributes:
+        text: Plain text.
+        style: Look of it: bold; small, on a line below; a failure; a badge; or the colour of a verdict.
+        before: Plain text between it and the part before.
     """
 
     text: str
@@ -67,17 +69,21 @@ Cell = str | tuple[Part, ...]
 class Head:
     """A column of a table.
 
-    Attributes: title: Its title. unit: Unit of its figures; empty without one. second: Second part
-        of the title, on a line of its own where there is room for lines. is_number: Whether it
-        holds figures, to the right, or words. wraps: Whether its words may stand on several lines
-        of a terminal, but for the longest. leaves: Turn in which it is left out where a terminal
-        has no room: 1 before 2; 0 for never. The last one of
+    Attributes:
+        title: Its title.
+        unit: Unit of its figures; empty without one.
+        note: Meaning that the title leaves open, for the caption; empty where it says it all.
+        second: Second part of the title, on a line of its own where there is room for lines.
+        is_number: Whether it holds figures, to the right, or words.
+        wraps: Whether its words may stand on several lines of a terminal, but for the longest.
+        leaves: Turn in which it is left out where a terminal has no room: 1 before 2; 0 for never. The last one of
             those that may leave stays.
         titles: Whether the title of the table may name its value, if it has but one.
     """
 
     title: str
     unit: str = ""
+    note: str = ""
     second: str = ""
     is_number: bool = True
     wraps: bool = False
@@ -118,10 +124,14 @@ class Row:
 class Table:
     """A table.
 
-    Attributes: heads: Its columns. rows: Its rows. keys: Columns that name a row. Where a terminal
-        or a page repeats them, they stand once, but for the last one. title: Above it on a
-        terminal. subjects: Names before the title. caption: Below it on a terminal. kind: Class of
-        it on a page.
+    Attributes:
+        heads: Its columns.
+        rows: Its rows.
+        keys: Columns that name a row. Where a terminal or a page repeats them, they stand once, but for the last one.
+        title: Above it on a terminal.
+        subjects: Names before the title.
+        caption: Below it on a terminal.
+        kind: Class of it on a page.
     """
 
     heads: tuple[Head, ...]
@@ -233,9 +243,11 @@ def _with_titles(table: Table) -> Table:
 
 def _terminal(table: Table, breaks_words: bool = False) -> RichTable:
     title = ": ".join(filter(None, [", ".join(table.subjects), table.title]))
+    notes = "; ".join(f"{head.title}: {head.note}" for head in table.heads if head.note)
+    caption = " ".join(filter(None, [notes and f"{notes}.", table.caption]))
     found = RichTable(
         title=Text(title) if title else None,
-        caption=Text(table.caption) if table.caption else None,
+        caption=Text(caption) if caption else None,
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
