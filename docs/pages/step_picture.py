@@ -61,12 +61,12 @@ def step_svg(rows: Rows) -> str:
     label = "Pelvis error and ZMP deviation over a step of 3 s, without and with compensation"
     parts = [_HEAD.format(width=_WIDTH, height=height, label=label)]
     for at, chart in enumerate(CHARTS):
-        parts += _drawn(chart, rows, _TOP + at * (_HEIGHT + _GAP))
+        parts += _draw(chart, rows, _TOP + at * (_HEIGHT + _GAP))
     parts.append(f'<text x="{_RIGHT}" y="{height - 6}" class="right">time in the step [s]</text>')
     return "\n".join([*parts, "</svg>", ""])
 
 
-def _drawn(chart: Chart, rows: Rows, top: float) -> list[str]:
+def _draw(chart: Chart, rows: Rows, top: float) -> list[str]:
     times = [float(row["time_s"]) for row in rows]
     bottom = top + _HEIGHT
 

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from docs.pages import arms, joints, speeds, walks
-from docs.pages.cells import KEPT, Cells, Rows, minus, page_table, read_rows, scaled
+from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
     GROUPS,
@@ -256,7 +256,7 @@ def figure(results: Results, place: str, now: str) -> str:
         raise ConfigurationError(f"{place!r} is no figure: give table; policy; reference; scenario; statistic; metric")
     row = Cells(results.tables[table]).row(*cell, statistic=statistic)
     decimals = len(now.partition(".")[2])
-    return minus(f"{scaled(row, metric):.{decimals}f}")
+    return minus(f"{in_table_unit(row, metric):.{decimals}f}")
 
 
 def marks(part: str) -> tuple[str, str]:
@@ -265,7 +265,7 @@ def marks(part: str) -> tuple[str, str]:
 
 
 def has_parts(text: str) -> bool:
-    """Whether a page has a mark of any part or figure."""
+    """True if a page has a mark of any part or figure."""
     return _FIGURE.search(text) is not None or any(mark in text for part in PARTS for mark in marks(part))
 
 

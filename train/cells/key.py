@@ -82,7 +82,7 @@ def _source(module: str) -> Path | None:
 
 
 def _files_of(module: Path) -> list[Path]:
-    """Where a module lies by its path without an ending: a package, or a file."""
+    """Files of a module, by its path without an ending: a package, or a file."""
     return [module / "__init__.py", module.with_name(f"{module.name}.py")]
 
 
@@ -95,12 +95,12 @@ def _with_imports(file: Path) -> list[Path]:
         if file in seen or not _is_file(file):
             continue
         seen.add(file)
-        for name in _imported(file):
+        for name in _imports(file):
             waiting += _files_of(file.parent.joinpath(*name.split(".")))
     return sorted(seen)
 
 
-def _imported(file: Path) -> Iterator[str]:
+def _imports(file: Path) -> Iterator[str]:
     """Modules that a file imports, by full name; none of a file that is no Python, which cannot be imported itself."""
     try:
         tree = ast.parse(read_bounded(file, _LARGEST_SOURCE))

@@ -34,7 +34,7 @@ HELD_OUT = "held out"
 PARTLY = "partly held out"
 """Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
-"""What a residual is compared with beside its base."""
+"""Title of the policy that a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
 """Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
 misses the truth, over five every eleventh."""
@@ -124,17 +124,17 @@ class Change:
 
     @property
     def falls_more(self) -> bool:
-        """Whether the policy fails in a greater share of its episodes than its base."""
+        """True if the policy fails in a greater share of its episodes than its base."""
         return self.falls * self.base_episodes > self.base_falls * self.episodes
 
     @property
     def falls_less(self) -> bool:
-        """Whether it fails in a smaller share."""
+        """True if it fails in a smaller share."""
         return self.falls * self.base_episodes < self.base_falls * self.episodes
 
     @property
     def sentence(self) -> str:
-        """What the row shows, and what it does not."""
+        """The row in a sentence: what it shows, and what it does not."""
         parts = [self._first_words()]
         missing = len(self.per_seed) - self.num_compared
         if self.is_family and 0 < missing < self.num_seeds:
@@ -431,7 +431,7 @@ def _marks(
     scenarios: Sequence[str],
     swept: Mapping[str, float],
 ) -> tuple[str, ...]:
-    """What training has seen of a row's condition."""
+    """Marks of a row: how far training has seen its condition."""
     if trained is None:
         return ()
     if trained.scenarios is None:
@@ -476,7 +476,7 @@ def _seen_as(condition: Condition, trained: Origin | None) -> str:
 
 
 def _motion(known: Environment, reference: Any) -> str:
-    """What of a reference training may have seen: its kind, or its step period whatever the number of steps."""
+    """The part of a reference that training may have seen: its kind, or its step period alone."""
     return known.label(known.arguments(reference)[known.motion])
 
 

@@ -1,4 +1,4 @@
-"""What the commands know of each environment: how it is made, what of it is kept, and how its figures are shown."""
+"""The environments as the commands know them: how it is made, what of it is kept, and how its figures are shown."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -163,16 +163,16 @@ class Environment:
     on_hardware: str = ""
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
-        """Whether all episodes of a condition are one and the same."""
+        """True if all episodes of a condition are one and the same."""
         return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
-        """Whether the episodes of a condition are of one robot and one motion."""
+        """True if the episodes of a condition are of one robot and one motion."""
         return not (self.is_real or make_scenario(scenario).draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:
-        """What such episodes are called in a sentence."""
+        """Name of such episodes in a sentence."""
         return "falls" if self.failure == "falls" else "failures"
 
     def title(self, reference_name: str) -> str:

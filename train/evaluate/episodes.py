@@ -17,7 +17,7 @@ from train.evaluate.support_changes import SupportChanges
 MOST_WORLDS = 64
 """Worlds that are played at once."""
 _BEFORE_FALL_S = 0.6
-"""What happens in this time before a fall does not set the scale of a figure [s]."""
+"""Time before a fall that does not set the scale of a figure [s]."""
 
 _REPORTED = 250
 """Control steps after which progress is reported."""
@@ -29,7 +29,7 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 
 @dataclass
 class Evaluation:
-    """What came out of a condition.
+    """The result of a condition.
 
     Attributes:
         condition: The condition.
@@ -57,7 +57,7 @@ class Evaluation:
 
     @property
     def first_failed(self) -> bool:
-        """Whether the episode of the trace is one of them."""
+        """True if the episode of the trace is one of them."""
         return bool(self.episodes and self.episodes[0]["termination"])
 
     @property
@@ -178,7 +178,7 @@ class _Observers:
         self._ended = set[int]()
 
     def watch(self, step: int, observation: Array, info: dict[str, Any], memory: Any) -> None:
-        """See a control step between the command and its effect."""
+        """Take a control step, between the command and its effect."""
         for world, trace in self._traces.items():
             if world not in self._ended:
                 trace.take(observation, info)

@@ -34,16 +34,16 @@ class Axis(Model):
     values: list[Any] = Field(min_length=2, max_length=MOST_ENTRIES)
     """Values in SI units; of the motion references as `references` has them."""
     label: Title | None = None
-    """What the axis says, with its unit; None for the description of the field."""
+    """Title of the axis, with its unit; None for the description of the field."""
 
     @property
     def is_motion(self) -> bool:
-        """Whether it varies the motion, and not the scenario."""
+        """True if it varies the motion, and not the scenario."""
         return not self.what.startswith(SCENARIO)
 
     @property
     def title(self) -> str:
-        """What the axis says."""
+        """Title of the axis, with its unit."""
         if self.label is not None:
             return self.label
         if self.is_motion:
@@ -120,7 +120,7 @@ class MapConfig(Model):
 
 
 def _choices(what: str, known: Environment) -> str:
-    """What an axis can vary."""
+    """Names that an axis can have."""
     hint = "; an option of the policies is varied by sweep, not by a map" if what in PolicyOptions.model_fields else ""
     return choices_listed(what, [known.motion, *scenario_fields()]) + hint
 

@@ -1,4 +1,4 @@
-"""What a training says of itself on the way, read without what trained it."""
+"""The evaluations on the way of a training, read without the code that trained it."""
 
 import csv
 from collections.abc import Mapping, Sequence

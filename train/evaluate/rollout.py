@@ -214,7 +214,7 @@ def make_shared_env(
 
 
 def shared_settings(condition: Condition) -> str:
-    """What conditions must have in common for a vector environment in common.
+    """Settings that conditions must share to share a vector environment.
 
     That is everything but the scenario of a walker, of which a policy knows the friction and the rate of the IMU.
     """
@@ -225,7 +225,7 @@ def shared_settings(condition: Condition) -> str:
 
 
 def can_share_worlds(condition: Condition) -> bool:
-    """Whether its policy does the same beside worlds of other scenarios.
+    """True if its policy does the same beside worlds of other scenarios.
 
     Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are of one.
     """

@@ -29,7 +29,7 @@ class Paired:
 
     @classmethod
     def of(cls, row: Change) -> Self:
-        """What a leaderboard keeps of a change."""
+        """The part of a change that a leaderboard keeps."""
         return cls(row.base, row.relative, row.verdict)
 
 
@@ -154,7 +154,7 @@ class _Scope:
 
     @property
     def name(self) -> tuple[str, str, bool]:
-        """What scopes of several policies have in common."""
+        """Name that scopes of several policies share."""
         return self.reference, self.scope, self.is_group
 
 

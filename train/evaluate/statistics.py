@@ -38,12 +38,12 @@ class Estimate:
 
     @property
     def has_interval(self) -> bool:
-        """Whether there are training seeds enough for an interval."""
+        """True if there are training seeds enough for an interval."""
         return self.low is not None
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a figure."""
+        """True if there is a figure."""
         return bool(np.isfinite(self.value))
 
     @property
@@ -62,7 +62,7 @@ class Estimate:
             "" if self.high is None else self.high,
         )
 
-    def scaled(self, factor: float) -> "Estimate":
+    def times(self, factor: float) -> "Estimate":
         """In another unit; the factor is positive."""
         if self.low is None or self.high is None:
             return Estimate(factor * self.value)

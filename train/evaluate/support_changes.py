@@ -1,4 +1,4 @@
-r"""What a policy knows of its local frame where the support foot changes, against the truth.
+r"""Errors of a policy's local frame where the support foot changes, against the truth.
 
 The local frame of a walking controller stands at the sole of the support foot, where joint angles and IMU put it
 (section II.B of the paper). Where joints give way, it is off by the vector e; for a deflection δ of the hip roll joint

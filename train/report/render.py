@@ -348,7 +348,7 @@ def number_interval(estimate: Estimate, column: Column) -> str:
     """A figure in the unit in which it is shown, with its interval; - where there is none."""
     if not np.isfinite(estimate.value):
         return "-"
-    shown = estimate.scaled(column.scale)
+    shown = estimate.times(column.scale)
     text = f"{shown.value:.{column.decimals}f}"
     if shown.low is None or shown.high is None:
         return text

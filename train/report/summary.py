@@ -115,6 +115,6 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def _legend(known: Environment, columns: Sequence[Column]) -> str:
-    """What the titles of the columns that are shown leave open."""
+    """Notes on the titles of the columns that are shown."""
     notes = "; ".join(f"{column.title}: {column.note}" for column in columns if column.note)
     return " ".join(sentence for sentence in (notes and f"{notes}.", known.note) if sentence)
