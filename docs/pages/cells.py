@@ -14,8 +14,7 @@ import yaml
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.episodes import group_by
-from train.report.render import Table, render
-from train.runs.escaping import write_csv
+from train.report.render import Table, render, write_table
 
 Rows = Sequence[Mapping[str, str]]
 """Rows of a table, a column by its name."""
@@ -97,7 +96,7 @@ def keep(run: Path, results: Path) -> Path:
     name = kept_name(run)
     kept = KEPT[name]
     head, *rows = condense(read_rows(run / "episodes.csv"), kept)
-    return write_csv([str(title) for title in head], rows, results / f"{kept.table or name}.csv")
+    return write_table([str(title) for title in head], rows, results / f"{kept.table or name}.csv")
 
 
 def kept_name(run: Path) -> str:

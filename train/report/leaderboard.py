@@ -17,8 +17,7 @@ from train.evaluate.episodes import group_by
 from train.evaluate.maps import best_of
 from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
-from train.report.render import Head, Part, Row, Table, print_table, render
-from train.runs.escaping import write_csv
+from train.report.render import Head, Part, Row, Table, print_table, render, write_table
 
 _BASE = ("base", "change", "change_low", "change_high", "verdict")
 _RIVAL = (
@@ -219,7 +218,7 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they agree."""
     table = folder / "leaderboard.csv"
     text = folder / "leaderboard.md"
-    write_csv(_HEAD, map(_record, found), table)
+    write_table(_HEAD, map(_record, found), table)
     write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")
     return [table, text]
 

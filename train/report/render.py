@@ -19,6 +19,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from elastic_env.core.errors import missing_extra
+from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.statistics import Estimate
 from train.figures.colours import NIGHT, VERDICTS
@@ -198,6 +199,13 @@ def render(table: Table, to: Literal["terminal", "markdown", "csv", "html"]) -> 
     return formats[to](table)
 
 
+def write_table(head: Iterable[str], rows: Iterable[Iterable[object]], path: Path) -> Path:
+    """Write a table of texts and numbers as CSV; None is empty."""
+    texts = (["" if cell is None else str(cell) for cell in row] for row in rows)
+    write_whole(path, render(Table.plain(head, texts), "csv"))
+    return path
+
+
 def print_table(table: Table, console: Console, file: str) -> None:
     """Print a table without the columns that the terminal has no room for, and name those and who has them.
 
@@ -319,11 +327,11 @@ def _csv(table: Table) -> str:
 
 
 def _html(table: Table) -> str:
-    return str(require_jinja2().module.table(table))  # type: ignore[attr-defined]
+    return str(require_jinja2("table.html.j2").module.table(table))  # type: ignore[attr-defined]
 
 
-def require_jinja2() -> "Template":
-    """The template of a page, which escapes all that is put into it.
+def require_jinja2(name: str = "page.html.j2") -> "Template":
+    """A template, by default that of a page; it escapes all that is put into it.
 
     Raises:
         MissingExtraError: Jinja2 is not installed.
@@ -341,7 +349,7 @@ def require_jinja2() -> "Template":
     )
     environment.filters.update(script_json=script_json)
     environment.globals.update(font=FONT, night=NIGHT, verdicts=VERDICTS)
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 def number_interval(estimate: Estimate, column: Column) -> str:
