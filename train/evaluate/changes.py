@@ -379,11 +379,12 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
         ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
     """
     for rows in (mine, base):
-        if rows.duplicated(["member", "seed"]).any():
+        if len(set(zip(rows["member"], rows["seed"], strict=True))) < len(rows):
             raise ValueError(f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}")
-    own = pd.DataFrame({"member": mine["member"], "seed": mine["seed"], "mine": mine[metric]})
-    others = pd.DataFrame({"seed": base["seed"], "base": base[metric]})
-    return own.merge(others, on="seed").sort_values("seed", kind="stable").dropna()
+    own = mine.sort_values("seed", kind="stable")
+    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy()).reindex(own["seed"].to_numpy())
+    figures = {"member": own["member"], "mine": own[metric], "base": others}
+    return pd.DataFrame({name: column.to_numpy() for name, column in figures.items()}).dropna()
 
 
 def _against(pairing: Pairing, groups: Groups) -> list[Change]:

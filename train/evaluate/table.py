@@ -106,7 +106,8 @@ class EpisodeTable:
 
     def of(self, policy: str, *cells: int) -> pd.DataFrame:
         """Rows of a policy in some cells."""
-        return pd.concat([self._parts[policy, cell] for cell in cells])
+        parts = [self._parts[policy, cell] for cell in cells]
+        return parts[0] if len(parts) == 1 else pd.concat(parts)
 
     @cached_property
     def _parts(self) -> dict[tuple[str, int], pd.DataFrame]:
