@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -21,6 +22,7 @@ from rich.text import Text
 
 from train.report.page import Page
 from train.report.render import Table as ReportTable
+from train.report.render import render
 from train.report.specs import PageChart
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
 from train.runs.escaping import (
@@ -230,3 +232,13 @@ def test_a_page_shows_a_label_as_it_is(label: str) -> None:
     assert page.tags == plain.tags
     assert html.unescape(page_of(label)).count(f">{label}<") == 13
     assert json.loads(page.scripts[1]) == {"name": label}
+
+
+@pytest.mark.parametrize(("to", "text"), [
+    ("markdown", "| a\\|&lt;b&gt;� |\n| --- |\n| =1+a\\|&lt;b&gt;� |"),
+    ("csv", "a|<b>�\r\n'=1+a|<b>�\r\n"),
+    ("html", "<td class=\"words\">=1+a|&lt;b&gt;�</td>"),
+])  # fmt: skip
+def test_a_table_is_escaped_at_its_one_outlet(to: Any, text: str) -> None:
+    """Catches a format in which the text of a label is a command, a tag or a formula."""
+    assert text in render(ReportTable.plain(["a|<b>\x1b"], [["=1+a|<b>\x1b"]]), to)

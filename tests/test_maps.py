@@ -23,7 +23,7 @@ from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
 from train.experiments.compare import CompareConfig
 from train.figures.comparison_figures import draw_maps
-from train.figures.map_plots import Square, blended, panels
+from train.figures.map_plots import Square, blend, panels
 from train.report import Results, write_report
 from train.report.change_tables import write_maps
 from train.runs.folders import run_folder
@@ -224,8 +224,8 @@ def test_panels_say_who_is_best_and_by_how_much_learning_is_ahead() -> None:
     assert [entry[:2] for entry in best.key] == [("A", "base"), ("B", "best"), ("C", "learned")]
     assert [[s.text for s in row] for row in best.squares] == [["C", "A"], ["A", "-"]]
     assert [[s.text for s in row] for row in learned.squares] == [["−50", "+200"], ["−25", "-"]]
-    assert learned.squares[0][0].colour == blended("#1a7f5a", 0.75 * 0.5)
-    assert learned.squares[0][1].colour == blended("#b42318", 0.75)
+    assert learned.squares[0][0].colour == blend("#1a7f5a", 0.75 * 0.5)
+    assert learned.squares[0][1].colour == blend("#b42318", 0.75)
     assert learned.squares[1][0].small == "to A ✕5/10"
     assert [panel.title.split(",")[0] for panel in levels] == ["base", "best", "learned"]
     few = grid({place: {t: v for t, v in own.items() if t != "best"} for place, own in FOUR.items()})

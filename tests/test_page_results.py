@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from docs.pages.cells import KEPT, Cells, Kept, condensed, keep, read_rows, scaled
+from docs.pages.cells import KEPT, Cells, Kept, condense, in_table_unit, keep, read_rows
 from docs.pages.learned import MAPS, learned_maps
 from docs.pages.write import PARTS, PICTURES, TABLES, Results, figure, marks, page_with, pages, reads
 from docs.pages.write import main as write_pages
@@ -154,16 +154,16 @@ EPISODES = [
 
 def test_a_cell_has_its_statistics_without_those_who_fell() -> None:
     """Catches a fall that is averaged in, a mean in the place of a median, and cells that run into each other."""
-    head, *rows = condensed(EPISODES, Kept(("pelvis_error_rms_rad",), ("median", "mean", "worst")))
+    head, *rows = condense(EPISODES, Kept(("pelvis_error_rms_rad",), ("median", "mean", "worst")))
     table = [dict(zip(map(str, head), map(str, row), strict=True)) for row in rows]
     cells = Cells(table)
     row = cells.row("input", "3 s", "soft")
-    assert (row["episodes"], row["failed"], scaled(row, "pelvis_error_rms_rad")) == ("4", "1", 3.0)
+    assert (row["episodes"], row["failed"], in_table_unit(row, "pelvis_error_rms_rad")) == ("4", "1", 3.0)
     assert cells.row("input", "3 s", "soft", "mean")["pelvis_error_rms_rad"] == "0.004"
     assert cells.row("input", "3 s", "soft", "worst")["pelvis_error_rms_rad"] == "0.008"
     assert cells.row("zero", "3 s", "soft")["pelvis_error_rms_rad"] == ""
     assert [cells.has("input", "3 s", "push"), cells.has("zero", "3 s", "push")] == [True, False]
-    some = condensed(EPISODES, Kept(("pelvis_error_rms_rad",), only={"policy": ["zero"]}))
+    some = condense(EPISODES, Kept(("pelvis_error_rms_rad",), only={"policy": ["zero"]}))
     assert len(list(some)) == 2
 
 

@@ -380,7 +380,8 @@ def test_references_are_swept_by_their_step_period() -> None:
     """Catches a list of durations that has no place on the axis."""
     references = [3, [0.8, 0.6, 0.8], {"step_period": 24, "num_steps": 2}]
     points = by_reference([made_up(walk(reference=reference), ("", 0.01)) for reference in references])
-    (curve,) = sweep_chart(points, [walk().environment.overview], "", {"input": "#000000"}).panels[0].curves
+    chart = sweep_chart(points, [walk().environment.overview], "", policy_colours(list(points)))
+    (curve,) = chart.panels[0].curves
     np.testing.assert_allclose(curve.x, [2.2, 3.0, 24.0])
 
 

@@ -29,7 +29,7 @@ def one_arm(gallery: Rows) -> str:
 
 
 def link_encoders(episodes: Rows) -> str:
-    """What encoders on the links of an arm are worth: error of the end effector, episode by episode."""
+    """Error of the end effector with and without encoders on the links of an arm, episode by episode."""
     rows = []
     for scenario, own in group_by(episodes, lambda row: row["scenario"]).items():
         errors = {p: np.array([float(row[_TOOL]) for row in own if row["policy"] == p]) for p in _POLICIES}
@@ -61,7 +61,7 @@ def arm_identification(rows: Rows) -> str:
     kinds = group_by(rows, lambda row: (row["poses"], row["log"]))
     joints = group_by(rows, lambda row: row["joint"])
     head = ["", *(f"{poses} poses, {log}" for poses, log in kinds)]
-    counted = [[f"`{joint}`", *(_counted(row) for row in own)] for joint, own in joints.items()]
+    counted = [[f"`{joint}`", *(_count(row) for row in own)] for joint, own in joints.items()]
     arm = [own[0] for own in kinds.values()]
     errors = [
         ["**error before [mm]**", *(f"{1e3 * float(row['before_median_m']):.1f}" for row in arm)],
@@ -73,7 +73,7 @@ def arm_identification(rows: Rows) -> str:
     return page_table(head, [*counted, *errors])
 
 
-def _counted(row: Mapping[str, str]) -> str:
+def _count(row: Mapping[str, str]) -> str:
     half_width = 100.0 * float(row["half_width_median"])
     wide = f"± {half_width:.2g} %" if half_width < 100.0 else "no upper end"
     holds, within, told = (round(float(row[name])) for name in ("holds", "within", "told_apart"))

@@ -14,8 +14,7 @@ import yaml
 
 from elastic_env.core.errors import ConfigurationError
 from train.evaluate.episodes import group_by
-from train.report.render import Table, render
-from train.runs.escaping import write_csv
+from train.report.render import Table, render, write_table
 
 Rows = Sequence[Mapping[str, str]]
 """Rows of a table, a column by its name."""
@@ -30,7 +29,7 @@ _STATISTICS: Mapping[str, Callable[[Sequence[float]], float]] = {
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of a comparison: metrics, and statistics over the episodes that did not fail."""
+    """The kept part of a comparison: metrics, and statistics over the episodes that did not fail."""
 
     metrics: Sequence[str]
     statistics: Sequence[str] = ("median",)
@@ -73,7 +72,7 @@ KEPT: Mapping[str, Kept] = {
 """Comparisons whose tables pages show, by the name of their configuration."""
 
 
-def condensed(episodes: Rows, kept: Kept) -> Iterator[list[object]]:
+def condense(episodes: Rows, kept: Kept) -> Iterator[list[object]]:
     """Head and rows of the table that is kept of the episodes of a comparison."""
     yield [*_PLACE, "statistic", "episodes", "failed", *kept.metrics]
     played = [row for row in episodes if all(row[name] in own for name, own in kept.only.items())]
@@ -96,8 +95,8 @@ def keep(run: Path, results: Path) -> Path:
     """
     name = kept_name(run)
     kept = KEPT[name]
-    head, *rows = condensed(read_rows(run / "episodes.csv"), kept)
-    return write_csv([str(title) for title in head], rows, results / f"{kept.table or name}.csv")
+    head, *rows = condense(read_rows(run / "episodes.csv"), kept)
+    return write_table([str(title) for title in head], rows, results / f"{kept.table or name}.csv")
 
 
 def kept_name(run: Path) -> str:
@@ -150,19 +149,19 @@ class Cells:
         return self._rows[key]
 
     def has(self, policy: str, reference: str, scenario: str) -> bool:
-        """Whether a cell was played."""
+        """True if a cell was played."""
         return (policy, reference, scenario, self.statistic) in self._rows
 
 
-def scaled(row: Mapping[str, str], metric: str) -> float:
+def in_table_unit(row: Mapping[str, str], metric: str) -> float:
     """A metric in the unit of the tables: mrad, mm, ms; nan where there is none."""
     scale = next((scale for suffix, scale in _SCALES.items() if metric.endswith(suffix)), 1.0)
     return scale * float(row[metric]) if row[metric] else math.nan
 
 
-def shown(row: Mapping[str, str], metrics: Iterable[str], decimals: int, between: str = " / ") -> str:
+def format_metrics(row: Mapping[str, str], metrics: Iterable[str], decimals: int, between: str = " / ") -> str:
     """Metrics side by side with so many decimals, - where there is none."""
-    values = (scaled(row, metric) for metric in metrics)
+    values = (in_table_unit(row, metric) for metric in metrics)
     return between.join("-" if math.isnan(value) else minus(f"{value:.{decimals}f}") for value in values)
 
 
@@ -176,6 +175,6 @@ def minus(text: str) -> str:
     return text.replace("-", "−")
 
 
-def failed(row: Mapping[str, str]) -> tuple[int, int]:
+def failure_counts(row: Mapping[str, str]) -> tuple[int, int]:
     """Failed episodes, and all."""
     return int(row["failed"]), int(row["episodes"])

@@ -1,7 +1,6 @@
 """Short films of the docs: the same motion without compensation on the left, and with compensation on the right.
 
-`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated
-WebP.
+`python -m docs.pages.films [CHECKOUT]` writes them into docs/images of a checkout, as animated WebP.
 """
 
 import sys
@@ -34,10 +33,12 @@ _QUALITY = 40
 class Film:
     """A motion that two policies play.
 
-    Attributes: condition: What is played; its policy is the one without compensation. compensated:
-        The policy on the right. begin_s, end_s: What is shown of the episode [s]. box: Left, upper,
-        right and lower edge of what is shown [pixels]; caption and legend are left out. width: Of
-        each of the two pictures [pixels].
+    Attributes:
+        condition: What is played; its policy is the one without compensation.
+        compensated: The policy on the right.
+        begin_s, end_s: What is shown of the episode [s].
+        box: Left, upper, right and lower edge of what is shown [pixels]; caption and legend are left out.
+        width: Of each of the two pictures [pixels].
     """
 
     condition: Condition

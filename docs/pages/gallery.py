@@ -2,8 +2,7 @@
 
     python -m docs.pages.gallery [CHECKOUT]     # docs/results/gallery.csv and docs/images/gallery
 
-Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of
-the robot.
+Everything is at rest. A servo holds its angle; the joint behind it gives way under the weight of the robot.
 """
 
 import csv
@@ -96,7 +95,7 @@ class AtRest:
         return np.apply_along_axis(self._compensator.command, -1, q_ref)
 
     def links(self, theta: Array, softer: float = 1.0) -> Array:
-        """Where the links are for angles of the servos, (..., n) [rad]; `softer` is true over assumed stiffness."""
+        """Angles of the links for angles of the servos, (..., n) [rad]; `softer` is true over assumed stiffness."""
         return static_link_angle(
             theta,
             softer * self.stiffness,

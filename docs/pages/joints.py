@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from docs.pages.cells import Cells, Rows, failed, minus, page_table, scaled
+from docs.pages.cells import Cells, Rows, failure_counts, in_table_unit, minus, page_table
 
 ERROR = "link_error_rms_rad"
 _AT_REST = ("link_error_imu_min_rad", "link_error_imu_max_rad")
@@ -29,7 +29,7 @@ def paper_testbed(rows: Rows, identified: Rows) -> str:
 
 def _range(cells: Cells, policy: str) -> str:
     row = cells.row(policy, "hold", "nominal")
-    return " to ".join(minus(f"{scaled(row, metric):+.1f}") for metric in _AT_REST)
+    return " to ".join(minus(f"{in_table_unit(row, metric):+.1f}") for metric in _AT_REST)
 
 
 def identification(rows: Rows) -> str:
@@ -88,7 +88,7 @@ def output_compensators(rows: Rows) -> str:
 
 
 def damping(rows: Rows, identified: Rows) -> str:
-    """What the damping of the transmission changes: the identification, the errors at rest and those in motion."""
+    """Effects of the damping of the transmission: the identification, the errors at rest and those in motion."""
     cells = Cells(rows)
     lines = []
     for row in identified:
@@ -96,7 +96,7 @@ def damping(rows: Rows, identified: Rows) -> str:
             continue
         d = f"{float(row['damping_nms_per_rad']):g}"
         motion = (
-            scaled(cells.row(f"{policy}: {d}", "sine", "nominal"), ERROR)
+            in_table_unit(cells.row(f"{policy}: {d}", "sine", "nominal"), ERROR)
             for policy in ("uncompensated", "input", "dynamic", "oracle")
         )
         lines.append(
@@ -148,7 +148,7 @@ def _rms(cells: Cells, policy: str, reference: str, scenario: str) -> str:
     if not cells.has(policy, reference, scenario):
         return _NOT_PLAYED
     row = cells.row(policy, reference, scenario)
-    if failed(row)[0]:
-        return "{} of {} failed".format(*failed(row))
-    value = scaled(row, ERROR)
+    if failure_counts(row)[0]:
+        return "{} of {} failed".format(*failure_counts(row))
+    value = in_table_unit(row, ERROR)
     return f"{value:.{1 if value >= 9.995 else 2}f}"

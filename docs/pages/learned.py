@@ -1,4 +1,4 @@
-"""What learning adds as tables of a page, from the `statistics.csv` or the `map.csv` that a comparison wrote."""
+"""Gains by learning as tables of a page, from the `statistics.csv` or the `map.csv` that a comparison wrote."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -154,7 +154,7 @@ def beyond_the_best(*tables: Rows) -> str:
 
 
 def learning_in_short(*tables: Rows) -> str:
-    """What residuals add to their bases, in groups of scenarios, each residual on the gait that it was trained on.
+    """Gains of residuals over their bases, in groups of scenarios, each residual on the gait that it was trained on.
 
     Args:
         tables: Rows of a `statistics.csv` each; the motion that comes first counts.
@@ -190,11 +190,11 @@ def _over_base(row: Mapping[str, str], unit: str) -> tuple[str, str]:
     base = 1e3 * float(row["base_mean"])
     return (
         f"{base:.{2 if unit == 'mrad' and base < _SMALL else 1}f}",
-        signed_off(_unbroken(percent_interval(Estimate(change, low, high))), verdict),
+        signed_off(_without_breaks(percent_interval(Estimate(change, low, high))), verdict),
     )
 
 
-def _unbroken(interval: str) -> str:
+def _without_breaks(interval: str) -> str:
     """A change whose interval stays on one line in a narrow table."""
     change, _, ends = interval.partition(" [")
     return "{} [{}".format(*(part.replace(" ", "\N{NO-BREAK SPACE}") for part in (change, ends)))

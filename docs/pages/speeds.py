@@ -60,7 +60,7 @@ def other_ways(*tables: Rows) -> str:
 
 
 def costs_of_cells(rows: Rows) -> str:
-    """What it takes to hand out a cell, and what a kill costs, from `tests.cluster_trials`."""
+    """Costs of handing out a cell and of a kill, from `tests.cluster_trials`."""
     lines = []
     for row in rows:
         what = f"{float(row['count']):,.0f}".replace(",", " ") + f" × {row['trial']}"
@@ -74,7 +74,7 @@ def costs_of_cells(rows: Rows) -> str:
 
 
 def policies_alone(standings: Sequence[Standing]) -> str:
-    """What `predict` takes for one world of the walker, as it was measured with the leaderboard."""
+    """Time of `predict` for one world of the walker, as measured with the leaderboard."""
     took = sorted({s.policy: s.step_us for s in standings}.items(), key=lambda own: own[1])
     lines = [[policy, f"{step_us:.0f}"] for policy, step_us in took]
     return page_table(["policy", "`predict` [µs]"], lines)

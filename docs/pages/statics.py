@@ -1,7 +1,6 @@
 """Tables of the docs that no comparison plays: identifications, Eq. 12 against Eq. 10, and gravity torques of a stance.
 
-`python -m docs.pages.statics [CHECKOUT]` writes them into docs/results of a checkout, in some
-minutes.
+`python -m docs.pages.statics [CHECKOUT]` writes them into docs/results of a checkout, in some minutes.
 """
 
 import sys

@@ -54,19 +54,19 @@ CHARTS = (
 def step_svg(rows: Rows) -> str:
     """The picture.
 
-    Args: rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals
-        of the charts.
+    Args:
+        rows: `time_s` from the beginning of a step, `single_support`, and per policy the signals of the charts.
     """
     height = _TOP + len(CHARTS) * (_HEIGHT + _GAP)
     label = "Pelvis error and ZMP deviation over a step of 3 s, without and with compensation"
     parts = [_HEAD.format(width=_WIDTH, height=height, label=label)]
     for at, chart in enumerate(CHARTS):
-        parts += _drawn(chart, rows, _TOP + at * (_HEIGHT + _GAP))
+        parts += _draw(chart, rows, _TOP + at * (_HEIGHT + _GAP))
     parts.append(f'<text x="{_RIGHT}" y="{height - 6}" class="right">time in the step [s]</text>')
     return "\n".join([*parts, "</svg>", ""])
 
 
-def _drawn(chart: Chart, rows: Rows, top: float) -> list[str]:
+def _draw(chart: Chart, rows: Rows, top: float) -> list[str]:
     times = [float(row["time_s"]) for row in rows]
     bottom = top + _HEIGHT
 

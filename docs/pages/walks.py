@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from docs.pages.cells import Cells, Rows, failed, minus, page_table, scaled, shown
+from docs.pages.cells import Cells, Rows, failure_counts, format_metrics, in_table_unit, minus, page_table
 from train.evaluate.standings import Standing
 
 PELVIS = "pelvis_error_rms_rad"
@@ -40,10 +40,10 @@ def all_scenarios(rows: Rows) -> str:
 
 
 def _walk(row: Mapping[str, str]) -> str:
-    fell, episodes = failed(row)
+    fell, episodes = failure_counts(row)
     if fell == episodes:
         return "fell"
-    text = f"{scaled(row, PELVIS):.1f}, {scaled(row, ZMP):.0f}"
+    text = f"{in_table_unit(row, PELVIS):.1f}, {in_table_unit(row, ZMP):.0f}"
     return f"{text} ({fell}/{episodes} fell)" if fell else text
 
 
@@ -77,11 +77,11 @@ def _robot(policy: str) -> str:
 
 
 def _paper_walk(row: Mapping[str, str]) -> list[str]:
-    fell, episodes = failed(row)
+    fell, episodes = failure_counts(row)
     if fell == episodes:
         return [f"{fell} of {episodes} fell" if episodes > 1 else "fell", *["–"] * 3]
-    angles = (f"{scaled(row, rms):.2f} / {scaled(row, peak):.1f}" for rms, peak in (_ROLL, _PITCH))
-    return [*angles, shown(row, _ZMPS, 1, ", "), shown(row, [_EARLY], 0)]
+    angles = (f"{in_table_unit(row, rms):.2f} / {in_table_unit(row, peak):.1f}" for rms, peak in (_ROLL, _PITCH))
+    return [*angles, format_metrics(row, _ZMPS, 1, ", "), format_metrics(row, [_EARLY], 0)]
 
 
 def local_frame(rows: Rows) -> str:
@@ -92,13 +92,13 @@ def local_frame(rows: Rows) -> str:
     for policy in cells.names("policy"):
         found = [cells.row(policy, reference, "nominal") for reference in references]
         if all(row[_FRAME] for row in found) and not policy.endswith("_open"):
-            lines.append([f"`{policy}`", *(shown(row, [m], 1) for m in (_FRAME, _JUMP) for row in found)])
+            lines.append([f"`{policy}`", *(format_metrics(row, [m], 1) for m in (_FRAME, _JUMP) for row in found)])
     head = ["", *(f"{what}, {reference}" for what in ("e", "jump") for reference in references)]
     return page_table(head, lines)
 
 
 def sensitivity(rows: Rows) -> str:
-    """What a change of robot, gait or controller does to the walk, with and without compensation."""
+    """Effects of changes of robot, gait or controller on the walk, with and without compensation."""
     cells = Cells(rows)
     changes = list(dict.fromkeys(policy.partition(": ")[2] for policy in cells.names("policy")))
     columns = [
@@ -114,10 +114,12 @@ def sensitivity(rows: Rows) -> str:
 
 def _sway(row: Mapping[str, str]) -> str:
     """Roll rms / peak, pitch peak, lateral ZMP deviation rms."""
-    if failed(row)[0]:
+    if failure_counts(row)[0]:
         return "fell"
-    peaks = (scaled(row, metric) for metric in (_ROLL[1], _PITCH[1], _ZMPS[2]))
-    return f"{scaled(row, _ROLL[0]):.1f} / " + ", ".join(f"{peak:.{0 if peak >= _LARGE else 1}f}" for peak in peaks)
+    peaks = (in_table_unit(row, metric) for metric in (_ROLL[1], _PITCH[1], _ZMPS[2]))
+    return f"{in_table_unit(row, _ROLL[0]):.1f} / " + ", ".join(
+        f"{peak:.{0 if peak >= _LARGE else 1}f}" for peak in peaks
+    )
 
 
 def gravity_torques(rows: Rows) -> str:
@@ -171,8 +173,8 @@ def imu_errors(rows: Rows) -> str:
         lines.append(
             [
                 f"`{policy}`",
-                *(shown(row, metrics, 2) for row in own),
-                str(sum(failed(row)[0] for row in own)),
+                *(format_metrics(row, metrics, 2) for row in own),
+                str(sum(failure_counts(row)[0] for row in own)),
             ]
         )
     head = ["policy", "`nominal`: pelvis / ZMP / IMU", "`imu`: pelvis / ZMP / IMU", "falls"]
@@ -180,7 +182,7 @@ def imu_errors(rows: Rows) -> str:
 
 
 def published_controllers(standings: Sequence[Standing]) -> str:
-    """What two teams published for their robots, beside no compensation."""
+    """Controllers that two teams published for their robots, beside no compensation."""
     found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s"}
     lines = [
         [
@@ -194,7 +196,7 @@ def published_controllers(standings: Sequence[Standing]) -> str:
 
 
 def learned_in_ten_walks(standings: Sequence[Standing]) -> str:
-    """What `iterative` learns on each robot, beside its base."""
+    """Scores of `iterative` on each robot, beside its base."""
     found = {(s.policy, s.scope, s.metric): s for s in standings if s.reference == "3 s" and not s.is_group}
     scopes = [scope for policy, scope, metric in found if (policy, metric) == ("iterative", PELVIS)]
     lines = [

@@ -2,10 +2,9 @@
 
     python -m docs.pages          # README.md and docs/*.md from docs/results
 
-A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard:
-end -->`. A figure within a sentence stands between `<!-- = paper; input_output; 3 s; nominal;
-pelvis_roll_rms_rad -->` and `<!-- / -->`. The tool writes all of them anew. A test fails where a
-page and the results disagree.
+A page has a part between two marks, such as `<!-- leaderboard: begin -->` and `<!-- leaderboard: end -->`. A figure
+within a sentence stands between `<!-- = paper; input_output; 3 s; nominal; pelvis_roll_rms_rad -->` and `<!-- / -->`.
+The tool writes all of them anew. A test fails where a page and the results disagree.
 """
 
 import re
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import baselines
 from docs.pages import arms, joints, speeds, walks
-from docs.pages.cells import KEPT, Cells, Rows, minus, page_table, read_rows, scaled
+from docs.pages.cells import KEPT, Cells, Rows, in_table_unit, minus, page_table, read_rows
 from docs.pages.learned import (
     ARM,
     GROUPS,
@@ -245,8 +244,10 @@ _FIGURE = re.compile(r"<!-- = (.*?) -->(.*?)<!-- / -->")
 def figure(results: Results, place: str, now: str) -> str:
     """A figure within a sentence, with as many decimals as it has now.
 
-    Args: results: The results. place: Table, policy, reference, scenario, metric, and a statistic
-        where it is not the first one. now: The text between its marks.
+    Args:
+        results: The results.
+        place: Table, policy, reference, scenario, metric, and a statistic where it is not the first one.
+        now: The text between its marks.
 
     Raises:
         ConfigurationError: There is no such figure.
@@ -257,7 +258,7 @@ def figure(results: Results, place: str, now: str) -> str:
         raise ConfigurationError(f"{place!r} is no figure: give table; policy; reference; scenario; statistic; metric")
     row = Cells(results.tables[table]).row(*cell, statistic=statistic)
     decimals = len(now.partition(".")[2])
-    return minus(f"{scaled(row, metric):.{decimals}f}")
+    return minus(f"{in_table_unit(row, metric):.{decimals}f}")
 
 
 def marks(part: str) -> tuple[str, str]:
@@ -266,15 +267,15 @@ def marks(part: str) -> tuple[str, str]:
 
 
 def has_parts(text: str) -> bool:
-    """Whether a page has a mark of any part or figure."""
+    """True if a page has a mark of any part or figure."""
     return _FIGURE.search(text) is not None or any(mark in text for part in PARTS for mark in marks(part))
 
 
 def page_with(text: str, results: Results) -> str:
     """A page with every part and every figure between its marks written anew.
 
-    Raises: ConfigurationError: It has no marks of any part, or not both of a part, each once and in
-        order.
+    Raises:
+        ConfigurationError: It has no marks of any part, or not both of a part, each once and in order.
     """
     parts = [part for part in PARTS if any(mark in text for mark in marks(part))]
     for part in parts or ([] if _FIGURE.search(text) else PARTS):

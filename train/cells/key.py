@@ -30,10 +30,9 @@ _LARGEST_SOURCE = 10_000_000
 def cell_key(condition: Condition) -> str:
     """SHA-256 digest of a condition, of the files that it names, and of the versions of the physics.
 
-    Files are weights of residuals, tables of offsets and stiffness, robots with their models and
-    joints, and Python files of the user's, with those of their folder that they import. They are
-    read and never imported. What such a file reads when it runs is not seen. Labels are text and
-    name no files.
+    Files are weights of residuals, tables of offsets and stiffness, robots with their models and joints, and Python
+    files of the user's, with those of their folder that they import. They are read and never imported. What such a file
+    reads when it runs is not seen. Labels are text and name no files.
     """
     content = condition.model_dump(mode="json", exclude=_NOT_OF_THE_RESULT)  # type: ignore[arg-type]
     named = condition.model_dump(mode="json", exclude=_LABELS)  # type: ignore[arg-type]
@@ -83,7 +82,7 @@ def _source(module: str) -> Path | None:
 
 
 def _files_of(module: Path) -> list[Path]:
-    """Where a module lies by its path without an ending: a package, or a file."""
+    """Files of a module, by its path without an ending: a package, or a file."""
     return [module / "__init__.py", module.with_name(f"{module.name}.py")]
 
 
@@ -96,12 +95,12 @@ def _with_imports(file: Path) -> list[Path]:
         if file in seen or not _is_file(file):
             continue
         seen.add(file)
-        for name in _imported(file):
+        for name in _imports(file):
             waiting += _files_of(file.parent.joinpath(*name.split(".")))
     return sorted(seen)
 
 
-def _imported(file: Path) -> Iterator[str]:
+def _imports(file: Path) -> Iterator[str]:
     """Modules that a file imports, by full name; none of a file that is no Python, which cannot be imported itself."""
     try:
         tree = ast.parse(read_bounded(file, _LARGEST_SOURCE))

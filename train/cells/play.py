@@ -45,9 +45,8 @@ def run_conditions(
 ) -> list[Evaluation]:
     """Evaluate conditions, the long ones first, and return their results in the order given.
 
-    The results do not depend on where they are played. On hardware the conditions come one after
-    the other, in this process, at whose terminal somebody can agree to them; nothing is kept of
-    them.
+    The results do not depend on where they are played. On hardware the conditions come one after the other, in this
+    process, at whose terminal somebody can agree to them; nothing is kept of them.
 
     Args:
         conditions: What to play.
@@ -64,14 +63,16 @@ def run_conditions(
         return [
             _on_hardware(condition, f"{n} of {len(conditions)}", console) for n, condition in enumerate(conditions, 1)
         ]
-    kept = [None] * len(conditions) if store is None or fresh else _kept(conditions, store, console)
+    kept = [None] * len(conditions) if store is None or fresh else _load_kept(conditions, store, console)
     missing = [condition for condition, found in zip(conditions, kept, strict=True) if found is None]
     if len(missing) < len(conditions):
         console.print(f"{len(conditions) - len(missing)} of {len(conditions)} cells are kept", soft_wrap=True)
     played = iter(_Playing(missing, console, place, store).results() if missing else [])
     results = [next(played) if found is None else Outcome(found) for found in kept]
     finished = [result.value for result in results if result is not None and result.error is None]
-    why = [_said(c, r) for c, r in zip(conditions, results, strict=True) if r is not None and r.error is not None]
+    why = [
+        _failure_text(c, r) for c, r in zip(conditions, results, strict=True) if r is not None and r.error is not None
+    ]
     if why:
         raise CellsFailedError(why, finished)
     if None in results:
@@ -79,7 +80,7 @@ def run_conditions(
     return finished
 
 
-def _kept(conditions: Sequence[Condition], store: Store, console: Console) -> list[Evaluation | None]:
+def _load_kept(conditions: Sequence[Condition], store: Store, console: Console) -> list[Evaluation | None]:
     """Cells that a store has; those whose files do not fit are said, once, and not taken."""
     found = list[Evaluation | None]()
     unfit = list[str]()
@@ -124,8 +125,8 @@ class _Playing:
         totals = {unit: sum(self._steps)}
         with show_progress(self._console, totals, transient=True, unit=unit) as self._show:
             if len(self._batches) == 1 and self._place.is_local:  # a process of its own takes seconds to start
-                cells = _evaluate(self._of(0), lambda played: self._reported(0, played), self._place.jobs)
-                self._ended(0, Outcome(cells))
+                cells = _evaluate(self._of(0), lambda played: self._report(0, played), self._place.jobs)
+                self._end(0, Outcome(cells))
             else:
                 self._beside()
         return self._outcomes
@@ -134,7 +135,7 @@ class _Playing:
         return [self._conditions[number] for number in self._batches[batch]]
 
     def _beside(self) -> None:
-        watch = Watch(self._reported, self._ended, moved=self._moved)
+        watch = Watch(self._report, self._end, moved=self._say_moved)
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
             with self._place.opened(len(self._batches), folder) as pool:
@@ -142,7 +143,7 @@ class _Playing:
                 given = [(self._of(batch), said) for batch in range(len(self._batches))]
                 run_calls(_evaluate_beside, given, pool, watch)
 
-    def _reported(self, batch: int, played: int) -> None:
+    def _report(self, batch: int, played: int) -> None:
         self._played[batch] = played
         if self._outcomes[self._batches[batch][0]] is None:  # a report may come behind the end
             self._running.add(batch)
@@ -153,7 +154,7 @@ class _Playing:
         tally = Tally(self._done, running, self._failed, len(self._conditions))
         self._show(0, sum(self._played), tally.in_words("cells"))
 
-    def _ended(self, batch: int, outcome: Outcome) -> None:
+    def _end(self, batch: int, outcome: Outcome) -> None:
         """Take the outcomes of a batch, or what ended all of it."""
         self._played[batch] = self._steps[batch]
         self._running.discard(batch)
@@ -168,7 +169,7 @@ class _Playing:
                 self._console.print(said, soft_wrap=True)
         self._show_progress()
 
-    def _moved(self, batch: int) -> None:
+    def _say_moved(self, batch: int) -> None:
         for condition in self._of(batch):
             self._console.print(f"a worker was lost; {_name(condition)} is played again", soft_wrap=True)
 
@@ -176,8 +177,9 @@ class _Playing:
 def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     """Conditions, by their numbers, that are played in one vector environment: many worlds cost less each.
 
-    Args: conditions: What to play. cores: Batches that are played at a time. There are twice as
-        many, if there can be: not all last as long.
+    Args:
+        conditions: What to play.
+        cores: Batches that are played at a time. There are twice as many, if there can be: not all last as long.
     """
     worlds = sum(condition.episodes for condition in conditions)
     most = min(worlds // (2 * cores), MOST_WORLDS)
@@ -204,8 +206,8 @@ def in_batches(conditions: Sequence[Condition], cores: int) -> list[list[int]]:
     return batches
 
 
-def _said(condition: Condition, outcome: Outcome) -> tuple[str, int]:
-    """What failed and the exit code; a defect's traceback goes to the terminal."""
+def _failure_text(condition: Condition, outcome: Outcome) -> tuple[str, int]:
+    """Text and exit code of a failure; a defect's traceback goes to the terminal."""
     error = outcome.error
     assert error is not None
     found = explained(error)
@@ -217,7 +219,7 @@ def _said(condition: Condition, outcome: Outcome) -> tuple[str, int]:
 
 
 def _name(condition: Condition) -> str:
-    """What a user calls a cell."""
+    """Name of a cell for a user."""
     swept = "".join(f", {name}={value:g}" for name, value in condition.swept.items())
     member = condition.member
     seed = "" if member is None or member.training_seed is None else f", training seed {member.training_seed}"

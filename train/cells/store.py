@@ -1,7 +1,6 @@
 """Finished cells on the disk: a file each under the key of its content, written whole or not at all.
 
-A file holds its key and a digest of the rest, and is checked against the condition before anything
-of it is used.
+A file holds its key and a digest of the rest, and is checked against the condition before anything of it is used.
 """
 
 import dataclasses
@@ -54,14 +53,14 @@ class Store:
     folder: Path
 
     def get(self, condition: Condition) -> Evaluation | None:
-        """What came out of a condition; None where nothing is kept of it.
+        """The kept result of a condition; None where nothing is kept of it.
 
         Raises:
             UnfitCellError: The file is damaged, was changed, or is that of another condition.
         """
         file = self._file(condition)
         try:
-            return _read(condition, file.stem, read_bounded(file, _MOST_BYTES, within=self.folder))
+            return _from_bytes(condition, file.stem, read_bounded(file, _MOST_BYTES, within=self.folder))
         except FileNotFoundError:
             return None
         except UnfitCellError as error:
@@ -79,21 +78,21 @@ class Store:
         Returns:
             Whether it is kept.
 
-        Raises: OSError: The disk is full, or the folder cannot be written; cells that were kept
-            before stay.
+        Raises:
+            OSError: The disk is full, or the folder cannot be written; cells that were kept before stay.
         """
         file = self._file(evaluation.condition)
         if key is not None and file.stem != key:
             return False
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(file, _written(evaluation, file.stem))
+        write_whole(file, _to_bytes(evaluation, file.stem))
         return True
 
     def _file(self, condition: Condition) -> Path:
         return self.folder / f"{cell_key(condition)}.npz"
 
 
-def _written(evaluation: Evaluation, key: str) -> bytes:
+def _to_bytes(evaluation: Evaluation, key: str) -> bytes:
     """An evaluation as a file of NumPy's, from which no code can run."""
     arrays: Arrays = {f"{_TRACE}/{name}": np.asarray(values) for name, values in evaluation.trace.items()}
     if evaluation.points is not None:
@@ -115,8 +114,8 @@ def _digest(arrays: Arrays) -> npt.NDArray[np.str_]:
     return np.array(found.hexdigest())
 
 
-def _read(condition: Condition, key: str, content: bytes) -> Evaluation:
-    """What a file holds of a condition.
+def _from_bytes(condition: Condition, key: str, content: bytes) -> Evaluation:
+    """The result of a condition in a file.
 
     Raises:
         UnfitCellError: It is whole, and holds something else.

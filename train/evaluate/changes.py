@@ -1,7 +1,6 @@
 """Paired changes of a comparison: every residual against its base and against the best policy without learning.
 
-Every baseline is compared with the base of the residuals, or without residuals with the first
-policy.
+Every baseline is compared with the base of the residuals, or without residuals with the first policy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,16 +28,16 @@ from train.evaluate.table import EpisodeTable, failures
 
 CEILING = "ceiling on the training condition"
 SAME_ROBOT = "trained robot"
-"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot
-is that of the training, so that evaluation differs by noise alone."""
+"""Scenario in which nothing is random: training and evaluation see the same; one whose only robot is that of the
+training, so that evaluation differs by noise alone."""
 HELD_OUT = "held out"
 PARTLY = "partly held out"
 """Scenario that training never saw; group of scenarios of which it saw some."""
 BEST_ANALYTIC = "best policy without learning"
-"""What a residual is compared with beside its base."""
+"""Title of the policy that a residual is compared with beside its base."""
 FEWEST_SEEDS = 5
-"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds
-every other one misses the truth, over five every eleventh."""
+"""Training seeds from which on an interval is taken for a verdict: of 95 % intervals over two seeds every other one
+misses the truth, over five every eleventh."""
 CLAIM_SEEDS = 10
 """Training seeds that a claim needs; with fewer, intervals exclude zero too often without any effect."""
 
@@ -59,22 +58,26 @@ Groups = Mapping[str, Sequence[str]]
 class Change:
     """A policy against its base in one metric, in one scenario or pooled over a group of them.
 
-    Attributes: policy, base: Titles. is_family: Whether the policy is a residual, so that it has
-        training seeds. reference: Label of the motion. scope: Scenario, or name of the group.
-        is_group: Whether it is a group. swept: Options that a sweep varies, and their values.
-        marks: What the reader has to know of the row: a ceiling, something held out. column: The
-        metric. is_judged: Whether policies are judged by it; else it stands in tables alone.
-        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a
-        baseline one value. relative: Interquartile mean of it over training seeds. improvement:
-        Probability that an episode is better than the base's. mine, theirs: Metric of the policy
-        and of its base over the pairs [SI]; the interquartile mean over training
+    Attributes:
+        policy, base: Titles.
+        is_family: Whether the policy is a residual, so that it has training seeds.
+        reference: Label of the motion.
+        scope: Scenario, or name of the group.
+        is_group: Whether it is a group.
+        swept: Options that a sweep varies, and their values.
+        marks: What the reader has to know of the row: a ceiling, something held out.
+        column: The metric.
+        is_judged: Whether policies are judged by it; else it stands in tables alone.
+        per_seed: Relative change of every training seed, nan where it has no pair, (seeds,); of a baseline one value.
+        relative: Interquartile mean of it over training seeds.
+        improvement: Probability that an episode is better than the base's.
+        mine, theirs: Metric of the policy and of its base over the pairs [SI]; the interquartile mean over training
             seeds.
         num_pairs: Pairs of training seed and episode.
         falls, episodes: Failed episodes of the policy, of all of its episodes.
         base_falls, base_episodes: The same of the base.
         failure: What failing is called, in the plural.
-        is_rival: Whether `base` is not the base of the residual but the best policy without
-            learning.
+        is_rival: Whether `base` is not the base of the residual but the best policy without learning.
     """
 
     policy: str
@@ -121,17 +124,17 @@ class Change:
 
     @property
     def falls_more(self) -> bool:
-        """Whether the policy fails in a greater share of its episodes than its base."""
+        """True if the policy fails in a greater share of its episodes than its base."""
         return self.falls * self.base_episodes > self.base_falls * self.episodes
 
     @property
     def falls_less(self) -> bool:
-        """Whether it fails in a smaller share."""
+        """True if it fails in a smaller share."""
         return self.falls * self.base_episodes < self.base_falls * self.episodes
 
     @property
     def sentence(self) -> str:
-        """What the row shows, and what it does not."""
+        """The row in a sentence: what it shows, and what it does not."""
         parts = [self._first_words()]
         missing = len(self.per_seed) - self.num_compared
         if self.is_family and 0 < missing < self.num_seeds:
@@ -376,11 +379,12 @@ def pair(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> pd.DataFrame:
         ValueError: A seed occurs twice, so that nobody can say which episode belongs to which.
     """
     for rows in (mine, base):
-        if rows.duplicated(["member", "seed"]).any():
+        if len(set(zip(rows["member"], rows["seed"], strict=True))) < len(rows):
             raise ValueError(f"every episode needs a seed of its own to be paired, got {rows['seed'].tolist()}")
-    own = pd.DataFrame({"member": mine["member"], "seed": mine["seed"], "mine": mine[metric]})
-    others = pd.DataFrame({"seed": base["seed"], "base": base[metric]})
-    return own.merge(others, on="seed").sort_values("seed", kind="stable").dropna()
+    own = mine.sort_values("seed", kind="stable")
+    others = pd.Series(base[metric].to_numpy(), base["seed"].to_numpy()).reindex(own["seed"].to_numpy())
+    figures = {"member": own["member"], "mine": own[metric], "base": others}
+    return pd.DataFrame({name: column.to_numpy() for name, column in figures.items()}).dropna()
 
 
 def _against(pairing: Pairing, groups: Groups) -> list[Change]:
@@ -428,7 +432,7 @@ def _marks(
     scenarios: Sequence[str],
     swept: Mapping[str, float],
 ) -> tuple[str, ...]:
-    """What training has seen of a row's condition."""
+    """Marks of a row: how far training has seen its condition."""
     if trained is None:
         return ()
     if trained.scenarios is None:
@@ -473,7 +477,7 @@ def _seen_as(condition: Condition, trained: Origin | None) -> str:
 
 
 def _motion(known: Environment, reference: Any) -> str:
-    """What of a reference training may have seen: its kind, or its step period whatever the number of steps."""
+    """The part of a reference that training may have seen: its kind, or its step period alone."""
     return known.label(known.arguments(reference)[known.motion])
 
 

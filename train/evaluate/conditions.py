@@ -24,7 +24,7 @@ from train.evaluate.environments import (
 MOST_EPISODES = 100_000
 """Episodes of a cell."""
 SCENARIO = "scenario."
-"""What stands before a field of the scenario that is varied, such as scenario.stiffness_scale."""
+"""Prefix of a field of the scenario that is varied, such as scenario.stiffness_scale."""
 
 
 def _options(value: dict[str, Any]) -> dict[str, Any]:
@@ -65,8 +65,8 @@ GivenRanges = Annotated[
     dict[str, Any] | Annotated[list[dict[str, Any]], Field(max_length=MOST_RANGES)],
     AfterValidator(_ranges),
 ]
-"""Intervals of drawn robots that differ from those of their scenario, by the names of
-`RobotRanges`; or several such mappings, each of an equal share of the robots."""
+"""Intervals of drawn robots that differ from those of their scenario, by the names of `RobotRanges`; or several such
+mappings, each of an equal share of the robots."""
 
 
 def require_drawn(scenarios: Sequence[str], ranges: GivenRanges) -> None:
@@ -114,8 +114,8 @@ class Member(Model):
     base: str
     """Title of the policy that it corrects."""
     rival: str | None = None
-    """Title of the best policy without learning and with the standard sensors; None where that is
-    the base, or nobody plays it."""
+    """Title of the best policy without learning and with the standard sensors; None where that is the base, or nobody
+    plays it."""
 
 
 class Condition(Model):
@@ -126,9 +126,8 @@ class Condition(Model):
     member: Member | None = None
     """Of a residual: which training seed the policy is, and what it corrects."""
     reference: GivenReference = "hold"
-    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s],
-    three durations [s], or a mapping with `step_period` and further arguments of the
-    environment."""
+    """The motion: on the testbed a name or a mapping with `kind`, on the walker a step period [s], three durations [s],
+    or a mapping with `step_period` and further arguments of the environment."""
     label: str | None = None
     """How tables and figures call the reference; None for what the environment calls it."""
     scenario: Title = "nominal"
@@ -137,7 +136,7 @@ class Condition(Model):
     ranges: GivenRanges = {}
     """Intervals in place of those of the scenario, where it draws robots from ranges."""
     swept: dict[str, float] = {}
-    """What is varied, and its value here: an option of the policy, or with `SCENARIO` before it one of the scenario."""
+    """The varied quantity and its value: an option of the policy, or with `SCENARIO` before it one of the scenario."""
     episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="number of episodes")
     seed: int = quantity(
         "1",
@@ -151,7 +150,7 @@ class Condition(Model):
 
     @property
     def environment(self) -> Environment:
-        """What is known of the environment."""
+        """The environment, as the commands know it."""
         return environment(self.env)
 
     @property
@@ -161,12 +160,12 @@ class Condition(Model):
 
     @property
     def cell(self) -> tuple[object, ...]:
-        """What tells the cells of a policy apart: motion, scenario and what is varied."""
+        """Key of the cell of a policy: motion, scenario, and the varied values."""
         return (self.reference_name, self.scenario, *self.swept.items())
 
     @property
     def number(self) -> float | None:
-        """What of the reference scores can be drawn against, such as the step period [s]; None for nothing."""
+        """Number of the reference that scores can be drawn against, such as the step period [s]; None for nothing."""
         return next(iter(self.environment.abscissa(self.reference).values()), None)
 
     @property
@@ -204,7 +203,7 @@ class Condition(Model):
 
     @property
     def track(self) -> Track:
-        """What the policy needs: as its specification says it, or its name."""
+        """Needs of the policy, by its specification or by its name."""
         return self.policy.track or track(self.policy.name, self.environment.walks)
 
 

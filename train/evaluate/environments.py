@@ -1,4 +1,4 @@
-"""What the commands know of each environment: how it is made, what of it is kept, and how its figures are shown."""
+"""The environments as the commands know them: how it is made, what of it is kept, and how its figures are shown."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -102,27 +102,35 @@ class TracedSignal:
 class Environment:
     """An environment as the commands see it.
 
-    Attributes: id: Its name for `gymnasium.make`. robot: Name of its task, under which trained
-        policies are kept. motion: Argument of `gymnasium.make` that says which motion is played;
-        what a configuration calls its reference. default_reference: Reference where none is named.
-        watched_reference: The same for a picture; None for the default. looped_policy: Policy in
-        the loop of which the speed is measured, the best that needs no truth. live_policy: Policy
-        that is timed against the clock; None for the looped one. on_hardware: Short name of the
-        same robot on hardware; empty where there is none. arguments: Arguments of `gymnasium.make`
-        for a reference. label: How tables and figures call a reference. draws: Whether episodes of
-        a reference have motions of their own. abscissa: What of a reference sweeps can be drawn
-        against, by name with unit; empty where there is nothing. traced: Signals of the first
-        episode that are kept. columns: The summary table. splits: Further tables of the summary,
-        title and columns. subject: What the summary table is about. note: What its reader has to
-        know beside the legend of the columns. figures: Names of the time series to draw, see
-        `train.figures.comparison_figures`. overview: Column of the bar chart. swept: Columns drawn
-        against a swept value. learned_from: Further arguments of worlds that are learned from,
-        which keep them apart from those of evaluation. judged: Columns that policies are compared
-        by, pair by pair. also: Columns whose paired changes stand in the tables too. curves:
-        Signals over time in the report. quantity: What a reference is, in titles; empty where its
-        label says it. failure: Heading for episodes that end before their time. is_real: Whether it
-        is hardware: one world at a time, in this process, without a truth to score by. walks:
-        Whether its policies are those of the walker.
+    Attributes:
+        id: Its name for `gymnasium.make`.
+        robot: Name of its task, under which trained policies are kept.
+        motion: Argument of `gymnasium.make` that says which motion is played; what a configuration calls its reference.
+        default_reference: Reference where none is named.
+        watched_reference: The same for a picture; None for the default.
+        looped_policy: Policy in the loop of which the speed is measured, the best that needs no truth.
+        live_policy: Policy that is timed against the clock; None for the looped one.
+        on_hardware: Short name of the same robot on hardware; empty where there is none.
+        arguments: Arguments of `gymnasium.make` for a reference.
+        label: How tables and figures call a reference.
+        draws: Whether episodes of a reference have motions of their own.
+        abscissa: What of a reference sweeps can be drawn against, by name with unit; empty where there is nothing.
+        traced: Signals of the first episode that are kept.
+        columns: The summary table.
+        splits: Further tables of the summary, title and columns.
+        subject: What the summary table is about.
+        note: What its reader has to know beside the legend of the columns.
+        figures: Names of the time series to draw, see `train.figures.comparison_figures`.
+        overview: Column of the bar chart.
+        swept: Columns drawn against a swept value.
+        learned_from: Further arguments of worlds that are learned from, which keep them apart from those of evaluation.
+        judged: Columns that policies are compared by, pair by pair.
+        also: Columns whose paired changes stand in the tables too.
+        curves: Signals over time in the report.
+        quantity: What a reference is, in titles; empty where its label says it.
+        failure: Heading for episodes that end before their time.
+        is_real: Whether it is hardware: one world at a time, in this process, without a truth to score by.
+        walks: Whether its policies are those of the walker.
     """
 
     id: str
@@ -155,16 +163,16 @@ class Environment:
     on_hardware: str = ""
 
     def is_deterministic(self, scenario: str, reference: Reference) -> bool:
-        """Whether all episodes of a condition are one and the same."""
+        """True if all episodes of a condition are one and the same."""
         return not (self.is_real or make_scenario(scenario).is_random or self.draws(reference))
 
     def differs_by_noise_alone(self, scenario: str, reference: Reference) -> bool:
-        """Whether the episodes of a condition are of one robot and one motion."""
+        """True if the episodes of a condition are of one robot and one motion."""
         return not (self.is_real or make_scenario(scenario).draws_robots or self.draws(reference))
 
     @property
     def failures(self) -> str:
-        """What such episodes are called in a sentence."""
+        """Name of such episodes in a sentence."""
         return "falls" if self.failure == "falls" else "failures"
 
     def title(self, reference_name: str) -> str:
@@ -179,8 +187,8 @@ _STEPS_OF_THE_PAPER = {"24 s": 2}
 def environment(name: str) -> Environment:
     """The environment of a short name, or that of a robot of one's own.
 
-    Args: name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT"
-        or "module:ROBOT", a
+    Args:
+        name: Short name; a file of a robot, see `train.evaluate.robot_file`; or "FILE.py:ROBOT" or "module:ROBOT", a
             `JointRobot`, which is imported and registered.
 
     Raises:

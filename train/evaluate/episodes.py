@@ -17,7 +17,7 @@ from train.evaluate.support_changes import SupportChanges
 MOST_WORLDS = 64
 """Worlds that are played at once."""
 _BEFORE_FALL_S = 0.6
-"""What happens in this time before a fall does not set the scale of a figure [s]."""
+"""Time before a fall that does not set the scale of a figure [s]."""
 
 _REPORTED = 250
 """Control steps after which progress is reported."""
@@ -29,11 +29,13 @@ KeyT = TypeVar("KeyT", bound=Hashable)
 
 @dataclass
 class Evaluation:
-    """What came out of a condition.
+    """The result of a condition.
 
-    Attributes: condition: The condition. episodes: Flat records, one per episode: seed, metrics,
-        termination. trace: Signals of the first episode over time, those that the environment's
-        description names. points: Static points of the first episode, with reference "hold".
+    Attributes:
+        condition: The condition.
+        episodes: Flat records, one per episode: seed, metrics, termination.
+        trace: Signals of the first episode over time, those that the environment's description names.
+        points: Static points of the first episode, with reference "hold".
         rest_references: References of the static points, (visits,) [rad].
     """
 
@@ -55,7 +57,7 @@ class Evaluation:
 
     @property
     def first_failed(self) -> bool:
-        """Whether the episode of the trace is one of them."""
+        """True if the episode of the trace is one of them."""
         return bool(self.episodes and self.episodes[0]["termination"])
 
     @property
@@ -76,12 +78,13 @@ def group_by(items: Iterable[ItemT], key: Callable[[ItemT], KeyT]) -> dict[KeyT,
 def evaluate(condition: Condition, progress: Progress | None = None, num_threads: int = 0) -> Evaluation:
     """Play all episodes of a condition. Episode i has seed + i, whatever the number of worlds and threads.
 
-    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it
-    may play episodes of the robots that it is scored on, under other noise, see
-    `baselines.adaptation.iterative`.
+    A policy with a method `rehearse(env, seed)` is given the environment before it is scored: it may play episodes of
+    the robots that it is scored on, under other noise, see `baselines.adaptation.iterative`.
 
-    Args: condition: What to play. progress: Called with the number of control steps done since the
-        last call, of all episodes together. num_threads: Threads of the physics, 0 for all cores.
+    Args:
+        condition: What to play.
+        progress: Called with the number of control steps done since the last call, of all episodes together.
+        num_threads: Threads of the physics, 0 for all cores.
     """
     return evaluate_together([condition], progress, num_threads)[0]
 
@@ -91,8 +94,10 @@ def evaluate_together(
 ) -> list[Evaluation]:
     """Play conditions of one policy side by side, which costs less; their results are those of `evaluate`.
 
-    Args: conditions: What to play: one, or several with the same `shared_settings` that can share
-        worlds. progress: See `evaluate`. num_threads: See `evaluate`.
+    Args:
+        conditions: What to play: one, or several with the same `shared_settings` that can share worlds.
+        progress: See `evaluate`.
+        num_threads: See `evaluate`.
     """
     results = [Evaluation(condition) for condition in conditions]
     episodes = [(result, number) for result in results for number in range(result.condition.episodes)]
@@ -173,7 +178,7 @@ class _Observers:
         self._ended = set[int]()
 
     def watch(self, step: int, observation: Array, info: dict[str, Any], memory: Any) -> None:
-        """See a control step between the command and its effect."""
+        """Take a control step, between the command and its effect."""
         for world, trace in self._traces.items():
             if world not in self._ended:
                 trace.take(observation, info)

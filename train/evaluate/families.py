@@ -1,7 +1,6 @@
 """Policies of a comparison with all training seeds of a residual, and with whom each residual is compared.
 
-A residual is compared with its base, and with the best policy without learning that reads the same
-sensors.
+A residual is compared with its base, and with the best policy without learning that reads the same sensors.
 """
 
 import difflib
@@ -67,8 +66,8 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
         policies: Policies as a configuration names them; `residual:PATH` may have * in its path.
         with_bases: Whether a base or a rival that is not among them is added, before its residual.
 
-    Raises: ConfigurationError: A pattern that matches no folder, a folder without residual, or
-        folders that do not belong
+    Raises:
+        ConfigurationError: A pattern that matches no folder, a folder without residual, or folders that do not belong
             together.
     """
     entrants: list[Entrant] = []
@@ -103,7 +102,7 @@ def expand(policies: Sequence[PolicySpec], with_bases: bool = True) -> list[Entr
 
 
 def is_residual(policy: PolicySpec) -> bool:
-    """Whether a policy is a trained residual, or a family of them."""
+    """True if a policy is a trained residual, or a family of them."""
     return policy.name.startswith(RESIDUAL)
 
 
@@ -142,8 +141,8 @@ def _members(pattern: str) -> list[tuple[Path, int | None, ResidualDescription]]
 def _matching(pattern: str) -> list[Path]:
     """Folders whose paths match a pattern.
 
-    Raises: ConfigurationError: The pattern stands for folders of any depth, which may be all of the
-        disk.
+    Raises:
+        ConfigurationError: The pattern stands for folders of any depth, which may be all of the disk.
     """
     if "**" in pattern:
         raise ConfigurationError(f"* stands for one part of a path, got {shown(pattern)}; leave ** out")
@@ -167,7 +166,7 @@ def _require_motion(folder: Path, description: ResidualDescription) -> None:
 
 
 def _nearest(pattern: Path) -> str:
-    """What lies where the folders of a pattern end to exist, the most similar names first, and what is shipped."""
+    """The folders beside a pattern that matches none, the most similar names first, and those that are shipped."""
     there = next(path for path in pattern.parents if os.path.isdir(path) and not _WILD.search(str(path)))  # noqa: PTH112
     names = [path.name for path in there.iterdir() if path.is_dir() and not path.name.startswith(".")]
     near = difflib.get_close_matches(pattern.relative_to(there).parts[0], names, n=_NEAREST, cutoff=0.0)
@@ -213,17 +212,17 @@ _OWN = ("name", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_ev
 
 
 def _kin(description: ResidualDescription) -> dict[str, object]:
-    """What the members of a family have in common."""
+    """Settings that the members of a family share."""
     config = description.training.get("config", {})
     trained = {f"the trained {name}": value for name, value in config.items() if name not in _OWN}
     return trained | {name: getattr(description, name) for name in ("robot", "base", "base_options", "settings")}
 
 
 def _plays(known: PolicySpec, description: ResidualDescription, residual: PolicySpec) -> bool:
-    """Whether a policy is the base of a residual, with the same options, in the same environment."""
+    """True if a policy is the base of a residual, with the same options, in the same environment."""
     return (
         known.name == description.base
-        and _given(known.options) == _base_options(description, residual)
+        and _set_options(known.options) == _base_options(description, residual)
         and known.env_options == residual.env_options
         and known.level == residual.level
     )
@@ -256,9 +255,8 @@ def _beside(
 def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequence[PolicySpec]) -> PolicySpec | None:
     """The best policy without learning, with the same sensors, in the same environment; None where that is the base.
 
-    One that is among the policies counts if it assumes the same stiffness, whatever its other
-    options. Where the base is that policy with options, it is compared with the plain one if that
-    is among the policies.
+    One that is among the policies counts if it assumes the same stiffness, whatever its other options. Where the base
+    is that policy with options, it is compared with the plain one if that is among the policies.
     """
     known = ENVIRONMENTS.get(description.robot)
     name = best_analytic(known is not None and known.walks)
@@ -268,7 +266,7 @@ def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequen
     is_base = name == description.base
     assumed = {option: value for option, value in options.items() if option in ASSUMED_OPTIONS}
     for policy in taken:
-        given = _given(policy.options)
+        given = _set_options(policy.options)
         mine = given if is_base else {option: v for option, v in given.items() if option in ASSUMED_OPTIONS}
         same = policy.env_options == residual.env_options and policy.level == residual.level
         if policy.name == name and mine == assumed and same:
@@ -278,10 +276,10 @@ def _rival(description: ResidualDescription, residual: PolicySpec, taken: Sequen
 
 def _base_options(description: ResidualDescription, residual: PolicySpec) -> dict[str, object]:
     """Options of the base: its own, and over them those that the comparison gives the residual."""
-    return _given({**description.base_options, **residual.options})
+    return _set_options({**description.base_options, **residual.options})
 
 
-def _given(options: dict[str, object]) -> dict[str, object]:
+def _set_options(options: dict[str, object]) -> dict[str, object]:
     return {name: value for name, value in options.items() if value is not None}
 
 

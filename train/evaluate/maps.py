@@ -29,22 +29,21 @@ class Axis(Model):
     """An axis of a map."""
 
     what: Title
-    """A field of the scenario, such as scenario.stiffness_scale or
-    scenario.pelvis_imu.bias_spread_rad, or the motion: step_period on the walker, reference on the
-    testbed."""
+    """A field of the scenario, such as scenario.stiffness_scale or scenario.pelvis_imu.bias_spread_rad, or the motion:
+    step_period on the walker, reference on the testbed."""
     values: list[Any] = Field(min_length=2, max_length=MOST_ENTRIES)
     """Values in SI units; of the motion references as `references` has them."""
     label: Title | None = None
-    """What the axis says, with its unit; None for the description of the field."""
+    """Title of the axis, with its unit; None for the description of the field."""
 
     @property
     def is_motion(self) -> bool:
-        """Whether it varies the motion, and not the scenario."""
+        """True if it varies the motion, and not the scenario."""
         return not self.what.startswith(SCENARIO)
 
     @property
     def title(self) -> str:
-        """What the axis says."""
+        """Title of the axis, with its unit."""
         if self.label is not None:
             return self.label
         if self.is_motion:
@@ -121,7 +120,7 @@ class MapConfig(Model):
 
 
 def _choices(what: str, known: Environment) -> str:
-    """What an axis can vary."""
+    """Names that an axis can have."""
     hint = "; an option of the policies is varied by sweep, not by a map" if what in PolicyOptions.model_fields else ""
     return choices_listed(what, [known.motion, *scenario_fields()]) + hint
 
@@ -130,11 +129,12 @@ def _choices(what: str, known: Environment) -> str:
 class MapCell:
     """One cell of a map.
 
-    Attributes: levels: Mean score of every policy over the episodes that did not fail; of residuals
-        over training seeds [SI]. failed: Episodes of every policy that failed, and all. best: The
-        best policy; None where no episode of any reached its end. best_analytic: The best one
-        without learning and with the standard sensors. learned: Paired change of every residual
-        against that one.
+    Attributes:
+        levels: Mean score of every policy over the episodes that did not fail; of residuals over training seeds [SI].
+        failed: Episodes of every policy that failed, and all.
+        best: The best policy; None where no episode of any reached its end.
+        best_analytic: The best one without learning and with the standard sensors.
+        learned: Paired change of every residual against that one.
     """
 
     levels: Mapping[str, Estimate]
@@ -195,8 +195,7 @@ def heat_maps(evaluations: Sequence[Evaluation], config: MapConfig) -> list[Heat
 def best_of(scores: Mapping[str, tuple[Estimate, tuple[int, int]]]) -> str | None:
     """The policy with the lowest score among those with the smallest share of failures; None where nobody has a score.
 
-    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures
-    count first.
+    A mean over the episodes that did not fail flatters whoever fails in the hard ones, so failures count first.
     """
 
     def rank(title: str) -> tuple[float, float]:

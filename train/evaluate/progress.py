@@ -1,4 +1,4 @@
-"""What a training says of itself on the way, read without what trained it."""
+"""The evaluations on the way of a training, read without the code that trained it."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -22,8 +22,9 @@ MOST_BYTES = 20_000_000
 class Curves:
     """Learning curves of the training seeds of a residual.
 
-    Attributes: decisions: Decisions at the evaluations that all of them have, (n,). ratios: Metric
-        over the base's, mean over scenarios, (seeds, n), by metric; nan where all episodes of
+    Attributes:
+        decisions: Decisions at the evaluations that all of them have, (n,).
+        ratios: Metric over the base's, mean over scenarios, (seeds, n), by metric; nan where all episodes of
             a scenario failed.
     """
 

@@ -22,11 +22,14 @@ FEWEST_ROBOTS = 4
 class RobotScores:
     """A policy in one metric over the drawn robots of a cell; of residuals over training seeds, with intervals.
 
-    Attributes: policy, reference, scenario: Titles of the cell. column: The metric. mean: Mean over
-        the robots [SI]. middle: Interquartile mean over the robots [SI]. worst: Mean of the worst
-        tenth of the robots [SI]. failed, episodes: Episodes that failed, and all. The figures are
-        of the others. better: Share of the robots for which the policy is better than another one,
-        by its title; ties count half,
+    Attributes:
+        policy, reference, scenario: Titles of the cell.
+        column: The metric.
+        mean: Mean over the robots [SI].
+        middle: Interquartile mean over the robots [SI].
+        worst: Mean of the worst tenth of the robots [SI].
+        failed, episodes: Episodes that failed, and all. The figures are of the others.
+        better: Share of the robots for which the policy is better than another one, by its title; ties count half,
             and to fail is worse than any value.
         failure: What failing is called, in the plural.
     """
@@ -93,9 +96,8 @@ def _better(mine: pd.DataFrame, base: pd.DataFrame, column: Column) -> Estimate:
 def share_better(mine: pd.DataFrame, base: pd.DataFrame, metric: str) -> float:
     """Share of the episodes of both in which the policy is better (lower) than the base; ties count half.
 
-    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode
-    in common. An episode that reached its end without a figure, such as a ZMP of feet that never
-    carried anything, is left out.
+    To fail is worse than any value, and where both fail it is a tie. nan where they have no episode in common. An
+    episode that reached its end without a figure, such as a ZMP of feet that never carried anything, is left out.
 
     Args:
         mine: Episodes of one cell with `seed`, `failed` and the metric.

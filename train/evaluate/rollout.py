@@ -33,10 +33,14 @@ class PolicyFailedError(ElasticError):
 class ControlStep:
     """One control step of a rollout.
 
-    Attributes: number: From 0 on. seen: Observation that the policy acted on. action: Its command.
-        observation: Observation after the step. info: Info after the step. terminated: Worlds that
-        failed in this step, (num_worlds,); of a scalar environment one truth value. truncated:
-        Worlds that reached their end.
+    Attributes:
+        number: From 0 on.
+        seen: Observation that the policy acted on.
+        action: Its command.
+        observation: Observation after the step.
+        info: Info after the step.
+        terminated: Worlds that failed in this step, (num_worlds,); of a scalar environment one truth value.
+        truncated: Worlds that reached their end.
     """
 
     number: int
@@ -62,9 +66,8 @@ def control_steps(
 ) -> Iterator[ControlStep]:
     """Play a policy from a reset on, one control step at a time, in one world or in many.
 
-    A scalar environment stops at the end of its episode. The worlds of a vector environment go on,
-    each with the next episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads
-    the steps stops when there are enough.
+    A scalar environment stops at the end of its episode. The worlds of a vector environment go on, each with the next
+    episode: by themselves, or in mode `DISABLED` by a reset here. Whoever reads the steps stops when there are enough.
 
     Args:
         env: The environment.
@@ -211,10 +214,9 @@ def make_shared_env(
 
 
 def shared_settings(condition: Condition) -> str:
-    """What conditions must have in common for a vector environment in common.
+    """Settings that conditions must share to share a vector environment.
 
-    That is everything but the scenario of a walker, of which a policy knows the friction and the
-    rate of the IMU.
+    That is everything but the scenario of a walker, of which a policy knows the friction and the rate of the IMU.
     """
     scenario = make_scenario(condition.scenario_played)
     walks = condition.environment.walks
@@ -223,10 +225,9 @@ def shared_settings(condition: Condition) -> str:
 
 
 def can_share_worlds(condition: Condition) -> bool:
-    """Whether its policy does the same beside worlds of other scenarios.
+    """True if its policy does the same beside worlds of other scenarios.
 
-    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are
-    of one.
+    Nobody knows that of code of one's own. The truth of several scenarios is none, and trials are of one.
     """
     name = condition.policy.name
     if ":" in name and not is_saved(name):

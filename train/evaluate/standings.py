@@ -29,7 +29,7 @@ class Paired:
 
     @classmethod
     def of(cls, row: Change) -> Self:
-        """What a leaderboard keeps of a change."""
+        """The part of a change that a leaderboard keeps."""
         return cls(row.base, row.relative, row.verdict)
 
 
@@ -37,18 +37,22 @@ class Paired:
 class Standing:
     """A policy in one metric, in one scenario or over a group of them: a row of `leaderboard.csv`.
 
-    Attributes: track: What the policy needs. policy: Its title. reference: Label of the motion.
-        scope: Scenario, or name of the group. is_group: Whether it is a group. is_column: Whether
-        it is a column of the leaderboard; else it stands in the table of single scenarios. title:
-        Words for the metric. metric: Its name, with its unit in SI. score: Mean over scenarios of
-        means over the episodes that did not fail; of residuals the interquartile mean
+    Attributes:
+        track: What the policy needs.
+        policy: Its title.
+        reference: Label of the motion.
+        scope: Scenario, or name of the group.
+        is_group: Whether it is a group.
+        is_column: Whether it is a column of the leaderboard; else it stands in the table of single scenarios.
+        title: Words for the metric.
+        metric: Its name, with its unit in SI.
+        score: Mean over scenarios of means over the episodes that did not fail; of residuals the interquartile mean
             over training seeds with its interval; nan where a scenario has no such episode.
         failed, episodes: Episodes that failed, and all.
         training_seeds: Of a residual; 0 of another policy.
         base: Of a residual: its change against its base.
-        rival: Of a residual: its change against the best policy without learning and with the
-            standard sensors, in the same scope and metric. It is chosen on the same episodes, which
-            favours it.
+        rival: Of a residual: its change against the best policy without learning and with the standard sensors, in the
+            same scope and metric. It is chosen on the same episodes, which favours it.
         step_us: Median time of the policy alone for a control step of one world [µs].
     """
 
@@ -77,8 +81,8 @@ def standings(
 ) -> list[Standing]:
     """The leaderboard, a row per policy, motion, scope and judged metric.
 
-    Columns are, for each motion, the groups whose scenarios are all played with it, and the
-    scenarios that are in none of these groups.
+    Columns are, for each motion, the groups whose scenarios are all played with it, and the scenarios that are in none
+    of these groups.
 
     Args:
         evaluations: All cells, one per training seed.
@@ -150,7 +154,7 @@ class _Scope:
 
     @property
     def name(self) -> tuple[str, str, bool]:
-        """What scopes of several policies have in common."""
+        """Name that scopes of several policies share."""
         return self.reference, self.scope, self.is_group
 
 

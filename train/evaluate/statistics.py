@@ -1,12 +1,10 @@
 """Statistics over training seeds: paired changes, interquartile means, bootstrap intervals, probability of improvement.
 
-What is drawn at random in learning is the training seed, so intervals are over training seeds and
-never over the episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its
-base on the same episodes.
+What is drawn at random in learning is the training seed, so intervals are over training seeds and never over the
+episodes of one of them [Agarwal 2021, Colas 2019]. A policy is compared with its base on the same episodes.
 
-[Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice", NeurIPS. [Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons
-of Reinforcement Learning Algorithms".
+[Agarwal 2021] R. Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS.
+[Colas 2019] C. Colas et al., "A Hitchhiker's Guide to Statistical Comparisons of Reinforcement Learning Algorithms".
 """
 
 from collections.abc import Sequence
@@ -29,8 +27,9 @@ _BOOTSTRAP_SEED = 0
 class Estimate:
     """A figure over training seeds.
 
-    Attributes: value: The figure; nan where there is none. low, high: 95 % interval over training
-        seeds; None where fewer than two of them have the figure.
+    Attributes:
+        value: The figure; nan where there is none.
+        low, high: 95 % interval over training seeds; None where fewer than two of them have the figure.
     """
 
     value: float
@@ -39,12 +38,12 @@ class Estimate:
 
     @property
     def has_interval(self) -> bool:
-        """Whether there are training seeds enough for an interval."""
+        """True if there are training seeds enough for an interval."""
         return self.low is not None
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a figure."""
+        """True if there is a figure."""
         return bool(np.isfinite(self.value))
 
     @property
@@ -63,7 +62,7 @@ class Estimate:
             "" if self.high is None else self.high,
         )
 
-    def scaled(self, factor: float) -> "Estimate":
+    def times(self, factor: float) -> "Estimate":
         """In another unit; the factor is positive."""
         if self.low is None or self.high is None:
             return Estimate(factor * self.value)
@@ -73,11 +72,12 @@ class Estimate:
 def change(mine: Array, base: Array) -> Array:
     """Relative change of every training seed: mean over scenarios, against the base's, minus one.
 
-    Args: mine: Means of a metric over episodes, (seeds, scenarios); nan where there is no pair of
-        episodes. base: The base's means over the same episodes, (seeds, scenarios).
+    Args:
+        mine: Means of a metric over episodes, (seeds, scenarios); nan where there is no pair of episodes.
+        base: The base's means over the same episodes, (seeds, scenarios).
 
-    Returns: (seeds,); nan where a scenario has no pair: without it the mean would be one over other
-        scenarios.
+    Returns:
+        (seeds,); nan where a scenario has no pair: without it the mean would be one over other scenarios.
     """
     mine = np.mean(mine, axis=-1)
     base = np.mean(base, axis=-1)
@@ -96,11 +96,10 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
 def worst_share_mean(values: Array, share: float = WORST) -> float:
     """Mean of the highest share of some values, their CVaR [Rockafellar2000]; nan of none.
 
-    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of
-    fewer than ten is the highest.
+    The value at the edge counts in part, so that 32 values have a worst tenth of 3.2. A tenth of fewer than ten is the
+    highest.
 
-    [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J.
-    Risk 2(3).
+    [Rockafellar2000] R. T. Rockafellar, S. Uryasev, "Optimization of Conditional Value-at-Risk", J. Risk 2(3).
     """
     if len(values) == 0:
         return float("nan")
@@ -137,8 +136,9 @@ def improvement(won: Array, played: Array) -> Estimate:
         won: Pairs of episodes in which the policy is better, (seeds, scenarios).
         played: Pairs of episodes, (seeds, scenarios).
 
-    Returns: Share of all pairs of training seed and episode, with an interval over training seeds.
-        As in `change`, seeds count that have pairs in every scenario.
+    Returns:
+        Share of all pairs of training seed and episode, with an interval over training seeds. As in `change`, seeds
+        count that have pairs in every scenario.
     """
     whole = (played > 0).all(axis=1)
     both = sorted(zip(won[whole].sum(axis=1).tolist(), played[whole].sum(axis=1).tolist(), strict=True))

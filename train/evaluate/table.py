@@ -18,16 +18,15 @@ from train.evaluate.statistics import Estimate, over_seeds
 class EpisodeTable:
     """All episodes of a comparison.
 
-    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have
-    numbers.
+    A cell is a motion, a scenario, and the values of what a sweep or a map varies. Cells have numbers.
 
     Args:
         evaluations: All cells, one per training seed.
 
-    Attributes: rows: A row per episode, with `policy`, `member` (folder of a training seed; empty
-        of a policy
-            that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the
-            metrics [SI], nan where the episode failed.
+    Attributes:
+        rows: A row per episode, with `policy`, `member` (folder of a training seed; empty of a policy
+            that was not trained), `reference`, `scenario`, `cell`, `seed`, `failed`, and the metrics
+            [SI], nan where the episode failed.
         cells: Number of every cell, by `Condition.cell`.
         conditions: The first condition of every policy and cell.
         members: Training seeds of every residual, by title and folder.
@@ -107,7 +106,8 @@ class EpisodeTable:
 
     def of(self, policy: str, *cells: int) -> pd.DataFrame:
         """Rows of a policy in some cells."""
-        return pd.concat([self._parts[policy, cell] for cell in cells])
+        parts = [self._parts[policy, cell] for cell in cells]
+        return parts[0] if len(parts) == 1 else pd.concat(parts)
 
     @cached_property
     def _parts(self) -> dict[tuple[str, int], pd.DataFrame]:

@@ -22,8 +22,7 @@ _LINE = "#888888"
 def draw_arm_identification(fit: ArmFit, result: ArmIdentification, path: Path) -> Path:
     """A panel per joint with measured against predicted deflection, and one with the residual of every pose.
 
-    Measured is the predicted deflection and the part of the residual that a deflection of this
-    joint alone explains.
+    Measured is the predicted deflection and the part of the residual that a deflection of this joint alone explains.
     """
     plt = require_matplotlib()
     rows = -(-(len(result.joints) + 1) // _COLUMNS)

@@ -65,7 +65,7 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Failing:
-    """Where a policy fails: the values, and whether in all episodes."""
+    """Values at which a policy fails, each in all or in some of its episodes."""
 
     name: str
     colour: str
@@ -214,7 +214,7 @@ def sweep_chart(
         for title, own in cells.items():
             is_level = None in own
             x = np.array([values[0], values[-1]] if is_level else [value for value in values if value in own])
-            found = [statistic(own[None if is_level else value], column).scaled(column.scale) for value in x.tolist()]
+            found = [statistic(own[None if is_level else value], column).times(column.scale) for value in x.tolist()]
             ends = np.array([estimate.ends for estimate in found]).T
             curve = Curve(
                 title,

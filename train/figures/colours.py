@@ -59,5 +59,5 @@ def policy_colours(policies: Sequence[str]) -> dict[str, str]:
 
 
 def is_dashed(policy: str) -> bool:
-    """Whether the line of a policy is dashed: no center of mass is fed back."""
+    """True if the line of a policy is dashed: no center of mass is fed back."""
     return policy in _DASHED

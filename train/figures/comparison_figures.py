@@ -129,7 +129,7 @@ def swept_scenarios(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def has_swept_references(evaluations: Sequence[Evaluation]) -> bool:
-    """Whether the references are points of one axis: enough of them have a number, and each one of its own."""
+    """True if the references are points of one axis: enough of them have a number, and each one of its own."""
     numbers = {e.condition.reference_name: e.condition.number for e in evaluations}
     known = [number for number in numbers.values() if number is not None]
     return len(known) >= _MIN_SWEPT_REFERENCES and len(set(known)) == len(known)

@@ -81,7 +81,7 @@ def panels(heat_map: HeatMap) -> list[Panel]:
         _panel(
             heat_map,
             f"Best policy, and its {column.label}",
-            lambda c: _best(c, column, letters, shades),
+            lambda c: _best_square(c, column, letters, shades),
             key=key,
         )
     ]
@@ -91,7 +91,7 @@ def panels(heat_map: HeatMap) -> list[Panel]:
             _panel(
                 heat_map,
                 what,
-                lambda c, t=title: _learned(c.learned.get(t), letters if many else {}),
+                lambda c, t=title: _change_square(c.learned.get(t), letters if many else {}),
             )
         )
     levels = [e.value for cell in heat_map.flat for e in cell.levels.values() if np.isfinite(e.value) and e.value > 0.0]
@@ -101,7 +101,7 @@ def panels(heat_map: HeatMap) -> list[Panel]:
             _panel(
                 heat_map,
                 f"{title}, {column.label}",
-                lambda c, t=title: _level(c, t, column, ends),
+                lambda c, t=title: _score_square(c, t, column, ends),
                 is_main=False,
             )
         )
@@ -134,18 +134,18 @@ def _panel(heat_map: HeatMap, title: str, square: Callable[[MapCell], Square], *
     )
 
 
-def _best(cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]) -> Square:
+def _best_square(cell: MapCell, column: Column, letters: Mapping[str, str], shades: Mapping[str, str]) -> Square:
     if cell.best is None:
         return Square("-", "", _EMPTY)
     value = f"{column.scale * cell.levels[cell.best].value:.{_decimals(column)}f}"
     return Square(
         letters.get(cell.best, "?"),
         f"{value}{_falls(cell.failed[cell.best])}",
-        blended(shades[cell.best], _BEST_SHARE),
+        blend(shades[cell.best], _BEST_SHARE),
     )
 
 
-def _learned(change: Change | None, letters: Mapping[str, str]) -> Square:
+def _change_square(change: Change | None, letters: Mapping[str, str]) -> Square:
     """A change, with a sign where it is not told from chance; green below zero, red above."""
     if change is None or not np.isfinite(change.relative.value):
         return Square("-", "", _EMPTY)
@@ -156,11 +156,11 @@ def _learned(change: Change | None, letters: Mapping[str, str]) -> Square:
     return Square(
         percent(value).removesuffix(" %") + SIGNS.get(change.verdict, ""),
         f"{small}{falls}".strip(),
-        blended(_AHEAD if value < 0.0 else _BEHIND, share),
+        blend(_AHEAD if value < 0.0 else _BEHIND, share),
     )
 
 
-def _level(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
+def _score_square(cell: MapCell, title: str, column: Column, ends: tuple[float, float]) -> Square:
     if title not in cell.levels or not np.isfinite(cell.levels[title].value):
         return Square("-", _falls(cell.failed.get(title, (0, 0))).strip(), _EMPTY)
     value = cell.levels[title].value
@@ -169,7 +169,7 @@ def _level(cell: MapCell, title: str, column: Column, ends: tuple[float, float])
     return Square(
         f"{column.scale * value:.{_decimals(column)}f}",
         _falls(cell.failed[title]).strip(),
-        blended(_SCORE, 0.06 + (_STRONGEST - 0.06) * share),
+        blend(_SCORE, 0.06 + (_STRONGEST - 0.06) * share),
     )
 
 
@@ -182,7 +182,7 @@ def _decimals(column: Column) -> int:
     return min(column.decimals, 1)
 
 
-def blended(colour: str, share: float) -> str:
+def blend(colour: str, share: float) -> str:
     """A colour on white, of which it covers a share."""
     return "#" + "".join(f"{round(share * part + (1.0 - share) * 255):02x}" for part in _rgb(colour))
 
@@ -201,9 +201,9 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
             axis.text(x, y - 0.24, square.small, ha="center", va="center", color=square.ink, fontsize=7.5)
     axis.set_xticks(range(len(panel.x_ticks)), panel.x_ticks)
     axis.set_yticks(range(len(panel.y_ticks)), panel.y_ticks)
-    axis.set_xlabel(_wrapped(panel.x_label))
-    axis.set_ylabel(_wrapped(panel.y_label, 24))
-    axis.set_title(_wrapped(panel.title), fontsize=9.5)
+    axis.set_xlabel(_wrap(panel.x_label))
+    axis.set_ylabel(_wrap(panel.y_label, 24))
+    axis.set_title(_wrap(panel.title), fontsize=9.5)
     axis.grid(visible=False)
     axis.tick_params(length=0)
     for edge in np.arange(1, len(panel.x_ticks)) - 0.5:
@@ -215,7 +215,7 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
     if panel.key:
         text = "   ".join(f"{letter} {title}" for letter, title, _ in panel.key)
         axis.annotate(
-            _wrapped(text, 60),
+            _wrap(text, 60),
             (0.0, 0.0),
             (0, -34),
             xycoords="axes fraction",
@@ -225,7 +225,7 @@ def _draw_panel(axis: Any, panel: Panel) -> None:
         )
 
 
-def _wrapped(text: str, width: int = 52) -> str:
+def _wrap(text: str, width: int = 52) -> str:
     import textwrap
 
     return "\n".join(textwrap.wrap(text, width))

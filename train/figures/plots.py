@@ -163,8 +163,7 @@ def _show_numbers(axis: Any) -> None:
 def draw_overview(evaluations: Sequence[Evaluation], column: Column, path: Path) -> Path:
     """A metric of every policy: a panel per reference with all scenarios; of one scenario a panel with all references.
 
-    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that
-    failed.
+    Bars are medians over the episodes that did not fail, dots these episodes, crosses episodes that failed.
     """
     plt = require_matplotlib()
     known = evaluations[0].condition.environment

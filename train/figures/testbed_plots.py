@@ -38,9 +38,9 @@ def draw_identification(result: Identification, points: StaticPoints, models: Se
             "linewidths": 1.2,
         }
         top.scatter(torque[chosen], MRAD * deflection[chosen], label=label, zorder=3, **style)
-        fitted = _fitted(result, line, direction)
+        fitted = _fit_line(result, line, direction)
         top.plot(line, MRAD * fitted, color="#2a6f97", lw=0.9, ls="-" if direction > 0 else "--")
-        residual = deflection[chosen] - _fitted(result, torque[chosen], direction)
+        residual = deflection[chosen] - _fit_line(result, torque[chosen], direction)
         if result.imu_sine_error_rad is not None:
             residual = residual + result.imu_sine_error_rad * np.sin(points.q[chosen])
         bottom.scatter(torque[chosen], MRAD * residual, zorder=3, **style)
@@ -117,7 +117,7 @@ def static_errors(evaluation: Evaluation) -> Array:
     return references - points.q
 
 
-def _fitted(result: Identification, torque: Array, direction: int) -> Array:
+def _fit_line(result: Identification, torque: Array, direction: int) -> Array:
     load = torque + direction * result.friction_nm
     return load / result.stiffness_nm_per_rad + np.sign(load) * result.dead_band_rad / 2.0 + result.offset_rad
 

@@ -19,8 +19,7 @@ from train.evaluate.changes import (
     signed_interval,
 )
 from train.evaluate.maps import HeatMap
-from train.report.render import Head, Part, Row, Table, print_table
-from train.runs.escaping import write_csv
+from train.report.render import Head, Part, Row, Table, print_table, write_table
 
 _SIGNS = {HELD_OUT: "°", PARTLY: "(°)", CEILING: "†", SAME_ROBOT: "‡"}
 """Signs of marks, where there is little room."""
@@ -197,7 +196,7 @@ _MAP_HEAD = (
 def write_statistics(rows: Sequence[Change], path: Path) -> Path:
     """One row per change; metrics in SI units, changes and probabilities as shares of one."""
     swept = list(dict.fromkeys(name for row in rows for name in row.swept))
-    return write_csv([*_HEAD, *swept, *_FIGURES], (_record(row, swept) for row in rows), path)
+    return write_table([*_HEAD, *swept, *_FIGURES], (_record(row, swept) for row in rows), path)
 
 
 def _record(row: Change, swept: Sequence[str]) -> list[object]:
@@ -228,7 +227,7 @@ def _record(row: Change, swept: Sequence[str]) -> list[object]:
 
 def write_maps(maps: Sequence[HeatMap], path: Path) -> Path:
     """One row per cell, metric and policy; scores in SI units, changes as shares of one, axes as they are shown."""
-    return write_csv(_MAP_HEAD, (row for found in maps for row in _map_records(found)), path)
+    return write_table(_MAP_HEAD, (row for found in maps for row in _map_records(found)), path)
 
 
 def _map_records(found: HeatMap) -> Iterator[list[object]]:

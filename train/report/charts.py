@@ -46,7 +46,7 @@ def ladder(table: EpisodeTable, reference: str, colours: Mapping[str, str]) -> P
     for number, column in enumerate(columns):
         axis = nth(number)
         levels = [score(rung.rows, column) for rung in rungs]
-        edge = _edges([level.scaled(column.scale) for level in levels if level.is_known])
+        edge = _edges([level.times(column.scale) for level in levels if level.is_known])
         for policy in table.policies:
             own = [(rung, level) for rung, level in zip(rungs, levels, strict=True) if rung.policy == policy]
             symbol = "diamond" if policy in table.members else "circle"
@@ -104,7 +104,7 @@ def _edges(levels: Sequence[Estimate]) -> list[float]:
 
 def _points(own: Sequence[tuple[_Rung, Estimate]], column: Column, colour: str, symbol: str, axis: str) -> Spec:
     """Points of a policy with their intervals."""
-    known = [(rung, level.scaled(column.scale)) for rung, level in own if level.is_known]
+    known = [(rung, level.times(column.scale)) for rung, level in own if level.is_known]
     return {
         "type": "scatter",
         "mode": "markers",
@@ -217,7 +217,7 @@ def forest(rows: Sequence[Change]) -> PageChart:
 
 def _changes(own: Sequence[tuple[int, Change]], colour: str, axis: str) -> Spec:
     """Changes of one verdict, with their intervals."""
-    relative = [row.relative.scaled(100.0) for _, row in own]
+    relative = [row.relative.times(100.0) for _, row in own]
     symbols = [_symbol(row) for _, row in own]
     return {
         "type": "scatter",

@@ -17,8 +17,7 @@ from train.evaluate.episodes import group_by
 from train.evaluate.maps import best_of
 from train.evaluate.standings import Paired, Standing
 from train.evaluate.statistics import Estimate
-from train.report.render import Head, Part, Row, Table, print_table, render
-from train.runs.escaping import write_csv
+from train.report.render import Head, Part, Row, Table, print_table, render, write_table
 
 _BASE = ("base", "change", "change_low", "change_high", "verdict")
 _RIVAL = (
@@ -125,7 +124,7 @@ def _entry(standings: Sequence[Standing | None], is_best: Sequence[bool]) -> tup
     found = [s for s in standings if s is not None]
     if not found:
         return (Part("not played"),)
-    scores = [s.score.scaled(_column(s).scale) for s in found]
+    scores = [s.score.times(_column(s).scale) for s in found]
     parts = [
         Part(three_digits(score.value), "bold" if best else "", before=" / " if number else "")
         for number, (score, best) in enumerate(zip(scores, is_best, strict=True))
@@ -150,7 +149,7 @@ def _column(standing: Standing) -> Column:
 
 
 def claims_table(found: Sequence[Standing]) -> Table:
-    """What learning adds: the residuals' paired changes in every column; no rows without residuals."""
+    """The paired changes of residuals in every column; no rows without residuals."""
     learned = [s for s in found if s.is_column and s.training_seeds]
     titles = dict.fromkeys(s.title for s in learned)
     rows = []
@@ -187,7 +186,7 @@ PAIRED = (
 
 
 def legend(found: Sequence[Standing]) -> str:
-    """What a cell holds, and of how many episodes."""
+    """Meaning of a cell, and its number of episodes."""
     meaning = _meaning([s for s in found if s.is_column])
     counts = sorted({s.episodes // max(s.training_seeds, 1) for s in found if not s.is_group})
     span = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else str(counts[0])
@@ -206,7 +205,7 @@ def leaderboard_markdown(found: Sequence[Standing]) -> str:
 
 
 def claims_markdown(found: Sequence[Standing]) -> str:
-    """What learning adds, as a table."""
+    """The paired changes of residuals, as a table."""
     return f"{PAIRED}\n\n{render(claims_table(found), 'markdown')}\n"
 
 
@@ -219,7 +218,7 @@ def write_leaderboard(found: Sequence[Standing], folder: Path) -> list[Path]:
     """Write `leaderboard.csv` and `leaderboard.md`; the latter from the former, so that they agree."""
     table = folder / "leaderboard.csv"
     text = folder / "leaderboard.md"
-    write_csv(_HEAD, map(_record, found), table)
+    write_table(_HEAD, map(_record, found), table)
     write_whole(text, f"# Leaderboard\n\n{leaderboard_markdown(read_leaderboard(table))}")
     return [table, text]
 

@@ -27,9 +27,11 @@ class Page:
     def add(self, kind: Kind, content: Any, folded: str | None = None, is_open: bool = False) -> None:
         """Add to the section.
 
-        Args: kind: What it is. content: A text, texts, pairs of texts, a `Table`, a `Chart`, or the
-            panels of a map. folded: Title under which it is folded away; None if it is not. A chart
-            is drawn when it is unfolded. is_open: Whether it is unfolded at first.
+        Args:
+            kind: What it is.
+            content: A text, texts, pairs of texts, a `Table`, a `Chart`, or the panels of a map.
+            folded: Title under which it is folded away; None if it is not. A chart is drawn when it is unfolded.
+            is_open: Whether it is unfolded at first.
         """
         self.sections[-1]["parts"].append({"kind": kind, "content": content, "folded": folded, "is_open": is_open})
 

@@ -19,6 +19,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from elastic_env.core.errors import missing_extra
+from elastic_env.core.files import write_whole
 from train.evaluate.environments import Column
 from train.evaluate.statistics import Estimate
 from train.figures.colours import NIGHT, VERDICTS
@@ -51,8 +52,10 @@ _WORD = re.compile(r"\S+(?: [^\w\s]+)*")
 class Part:
     """A piece of a cell.
 
-    Attributes: text: Plain text. style: Look of it: bold; small, on a line below; a failure; a
-        badge; or the colour of a verdict. before: Plain text between it and the part before.
+    Attributes:
+        text: Plain text.
+        style: Look of it: bold; small, on a line below; a failure; a badge; or the colour of a verdict.
+        before: Plain text between it and the part before.
     """
 
     text: str
@@ -67,17 +70,21 @@ Cell = str | tuple[Part, ...]
 class Head:
     """A column of a table.
 
-    Attributes: title: Its title. unit: Unit of its figures; empty without one. second: Second part
-        of the title, on a line of its own where there is room for lines. is_number: Whether it
-        holds figures, to the right, or words. wraps: Whether its words may stand on several lines
-        of a terminal, but for the longest. leaves: Turn in which it is left out where a terminal
-        has no room: 1 before 2; 0 for never. The last one of
+    Attributes:
+        title: Its title.
+        unit: Unit of its figures; empty without one.
+        note: Meaning that the title leaves open, for the caption; empty where it says it all.
+        second: Second part of the title, on a line of its own where there is room for lines.
+        is_number: Whether it holds figures, to the right, or words.
+        wraps: Whether its words may stand on several lines of a terminal, but for the longest.
+        leaves: Turn in which it is left out where a terminal has no room: 1 before 2; 0 for never. The last one of
             those that may leave stays.
         titles: Whether the title of the table may name its value, if it has but one.
     """
 
     title: str
     unit: str = ""
+    note: str = ""
     second: str = ""
     is_number: bool = True
     wraps: bool = False
@@ -118,10 +125,14 @@ class Row:
 class Table:
     """A table.
 
-    Attributes: heads: Its columns. rows: Its rows. keys: Columns that name a row. Where a terminal
-        or a page repeats them, they stand once, but for the last one. title: Above it on a
-        terminal. subjects: Names before the title. caption: Below it on a terminal. kind: Class of
-        it on a page.
+    Attributes:
+        heads: Its columns.
+        rows: Its rows.
+        keys: Columns that name a row. Where a terminal or a page repeats them, they stand once, but for the last one.
+        title: Above it on a terminal.
+        subjects: Names before the title.
+        caption: Below it on a terminal.
+        kind: Class of it on a page.
     """
 
     heads: tuple[Head, ...]
@@ -188,6 +199,13 @@ def render(table: Table, to: Literal["terminal", "markdown", "csv", "html"]) -> 
     return formats[to](table)
 
 
+def write_table(head: Iterable[str], rows: Iterable[Iterable[object]], path: Path) -> Path:
+    """Write a table of texts and numbers as CSV; None is empty."""
+    texts = (["" if cell is None else str(cell) for cell in row] for row in rows)
+    write_whole(path, render(Table.plain(head, texts), "csv"))
+    return path
+
+
 def print_table(table: Table, console: Console, file: str) -> None:
     """Print a table without the columns that the terminal has no room for, and name those and who has them.
 
@@ -233,9 +251,11 @@ def _with_titles(table: Table) -> Table:
 
 def _terminal(table: Table, breaks_words: bool = False) -> RichTable:
     title = ": ".join(filter(None, [", ".join(table.subjects), table.title]))
+    notes = "; ".join(f"{head.title}: {head.note}" for head in table.heads if head.note)
+    caption = " ".join(filter(None, [notes and f"{notes}.", table.caption]))
     found = RichTable(
         title=Text(title) if title else None,
-        caption=Text(table.caption) if table.caption else None,
+        caption=Text(caption) if caption else None,
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
@@ -307,11 +327,11 @@ def _csv(table: Table) -> str:
 
 
 def _html(table: Table) -> str:
-    return str(require_jinja2().module.table(table))  # type: ignore[attr-defined]
+    return str(require_jinja2("table.html.j2").module.table(table))  # type: ignore[attr-defined]
 
 
-def require_jinja2() -> "Template":
-    """The template of a page, which escapes all that is put into it.
+def require_jinja2(name: str = "page.html.j2") -> "Template":
+    """A template, by default that of a page; it escapes all that is put into it.
 
     Raises:
         MissingExtraError: Jinja2 is not installed.
@@ -329,14 +349,14 @@ def require_jinja2() -> "Template":
     )
     environment.filters.update(script_json=script_json)
     environment.globals.update(font=FONT, night=NIGHT, verdicts=VERDICTS)
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 def number_interval(estimate: Estimate, column: Column) -> str:
     """A figure in the unit in which it is shown, with its interval; - where there is none."""
     if not np.isfinite(estimate.value):
         return "-"
-    shown = estimate.scaled(column.scale)
+    shown = estimate.times(column.scale)
     text = f"{shown.value:.{column.decimals}f}"
     if shown.low is None or shown.high is None:
         return text

@@ -37,7 +37,7 @@ from train.figures.colours import policy_colours
 
 @dataclass(frozen=True)
 class Results:
-    """What a report is about.
+    """The results that a report shows.
 
     Attributes:
         name: Name of the comparison.
@@ -98,7 +98,7 @@ class Results:
 
     @property
     def has_conditions(self) -> bool:
-        """Whether its cells are conditions of their own, and not points of a curve or a map."""
+        """True if its cells are conditions of their own, and not points of a curve or a map."""
         return self.swept is None and not self.maps
 
 
@@ -108,11 +108,11 @@ def headline(results: Results) -> str:
     failed, played = failures(table.rows)
     of_these = f"of which {failed} failed" if failed else "none of which failed"
     first = (
-        f"{_counted(len(table.policies), 'policy', 'policies')} played {_counted(played, 'episode')} in "
-        f"{_counted(len(table.scenarios), 'scenario')}, {of_these}."
+        f"{_count(len(table.policies), 'policy', 'policies')} played {_count(played, 'episode')} in "
+        f"{_count(len(table.scenarios), 'scenario')}, {of_these}."
     )
     best, worst = _best_and_worst(table)
-    return " ".join([first, best, _learned(results) or worst])
+    return " ".join([first, best, _learning_sentence(results) or worst])
 
 
 def _best_and_worst(table: EpisodeTable) -> tuple[str, str]:
@@ -146,20 +146,20 @@ def _scores(rows: pd.DataFrame, column: Column) -> dict[str, tuple[Estimate, tup
     return found
 
 
-def _learned(results: Results) -> str:
-    """What learning adds to its base in the first judged metric, or that there are too few training seeds to judge."""
+def _learning_sentence(results: Results) -> str:
+    """Change by learning in the first judged metric, or that there are too few training seeds to judge."""
     rows = [row for row in results.changes if row.is_family and row.is_judged and not row.is_rival]
     if not rows:
         return ""
     row = next((row for row in rows if row.is_group), rows[0])
     found = f"{row.policy} changes the {row.column.title} of {row.base} in {row.scope} by"
     if row.num_seeds < FEWEST_SEEDS:
-        few = f"{_counted(row.num_seeds, 'training seed')} cannot tell that from chance, {FEWEST_SEEDS} are needed"
+        few = f"{_count(row.num_seeds, 'training seed')} cannot tell that from chance, {FEWEST_SEEDS} are needed"
         return f"{found} {percent(row.relative.value)}; {few}."
     return f"{found} {percent_interval(row.relative)}."
 
 
-def _counted(number: int, one: str, several: str = "") -> str:
+def _count(number: int, one: str, several: str = "") -> str:
     return f"{number} {one if number == 1 else several or f'{one}s'}"
 
 
@@ -183,10 +183,10 @@ def facts(results: Results) -> list[tuple[str, str]]:
         ("made", f"{origin['created']}, commit {origin['commit'] or 'unknown'}"),
         ("versions", f"Python {origin['python']}, {versions}"),
     ]
-    return found + [(title, _trained(origin)) for title, origin in table.families.items()]
+    return found + [(title, _training_text(origin)) for title, origin in table.families.items()]
 
 
-def _trained(origin: Origin) -> str:
+def _training_text(origin: Origin) -> str:
     number = len(origin.folders)
     where = origin.folders[0] if number == 1 else f"{origin.folders[0]} to {origin.folders[-1]}"
     on = "an unknown condition" if origin.scenarios is None else ", ".join(origin.scenarios)
@@ -196,7 +196,7 @@ def _trained(origin: Origin) -> str:
 
 
 def in_short(results: Results) -> list[str]:
-    """What learning adds in a sentence each; then per residual and metric in how many cells it is better, or worse."""
+    """Gains by learning in a sentence each; then per residual and metric in how many cells it is better, or worse."""
     found = [sentence for heat_map in results.maps for sentence in of_a_map(heat_map)] + claims(results)
     for title in results.table.members:
         for is_rival in (False, True):
@@ -232,7 +232,7 @@ def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
     """Lines of a residual in one metric against one other policy: pooled figures, and in how many cells what holds."""
     found = [
         f"{row.policy} against {row.base}, {row.column.title}, pooled over {row.scope}{_at(results, row)}: "
-        f"{percent_interval(row.relative)}{marked(row)}{_besides(row)}."
+        f"{percent_interval(row.relative)}{marks_text(row)}{_besides(row)}."
         for row in own
         if row.is_group and not any(c.is_rival and c.policy == row.policy for c in results.changes)
     ]
@@ -243,7 +243,7 @@ def _of_a_metric(results: Results, own: Sequence[Change]) -> list[str]:
 
 
 def claims(results: Results) -> list[str]:
-    """What learning adds to the base of a residual, and to the best policy without learning: a sentence per scope.
+    """Gains by learning over the base of a residual, and to the best policy without learning: a sentence per scope.
 
     Scopes are the groups; without groups the scenarios, where there are few.
     """
@@ -269,8 +269,8 @@ def claims(results: Results) -> list[str]:
         )
         where = f"{'pooled over ' if rival.is_group else ''}{rival.scope}{_at(results, rival)}"
         found.append(
-            f"{rival.policy}, {rival.column.title}, {where}{marked(rival)}: {_compared(base)} than {base.base}, its "
-            f"base{_bounds(base)}; {_compared(rival)} than {rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}."
+            f"{rival.policy}, {rival.column.title}, {where}{marks_text(rival)}: {_comparison(base)} than {base.base}, "
+            f"its base{_bounds(base)}; {_comparison(rival)} than {rival.base}, the {BEST_ANALYTIC}{_bounds(rival)}."
         )
     return found
 
@@ -285,7 +285,7 @@ def _bounds(row: Change) -> str:
     return text[text.index(" [") :] if row.relative.has_interval else ""
 
 
-def _compared(row: Change) -> str:
+def _comparison(row: Change) -> str:
     """How much lower or higher, before "than"."""
     value = row.relative.value
     if not np.isfinite(value):
@@ -300,7 +300,7 @@ def _compared(row: Change) -> str:
 
 
 def _besides(row: Change) -> str:
-    """What the figures themselves do not say."""
+    """The part of a row's sentence that its figures do not say."""
     is_plain = row.verdict in ("lower", "higher") and ";" not in row.sentence
     return "" if is_plain else f": {row.sentence}"
 
@@ -322,13 +322,13 @@ def _at(results: Results, row: Change) -> str:
     return "".join(f", {part}" for part in [*([row.reference] if several else []), *swept])
 
 
-def marked(row: Change) -> str:
+def marks_text(row: Change) -> str:
     """Marks of a row in brackets."""
     return f" ({'; '.join(row.marks)})" if row.marks else ""
 
 
 def notes(results: Results) -> list[str]:
-    """What a reader needs to know, and only what concerns this comparison."""
+    """Notes that a reader of this comparison needs."""
     failure = results.environment.failures
     notes = [
         "A change is the mean of a policy over the episodes, over the mean of its base over the same episodes, minus "

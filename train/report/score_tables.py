@@ -12,8 +12,7 @@ from train.evaluate.episodes import group_by
 from train.evaluate.progress import Curves
 from train.evaluate.robots import RobotScores
 from train.evaluate.table import EpisodeTable, score
-from train.report.render import Head, Row, Table, number_interval, print_table
-from train.runs.escaping import write_csv
+from train.report.render import Head, Row, Table, number_interval, print_table, write_table
 
 SCORES = (
     "Mean over the episodes that reached the end; of residuals the interquartile mean over training seeds, with its "
@@ -95,7 +94,7 @@ def _three(row: RobotScores) -> str:
 
 def write_robots(rows: Sequence[RobotScores], path: Path) -> Path:
     """One row per cell, metric and other policy; metrics in SI units, shares as shares of one."""
-    return write_csv(_HEAD, (record for row in rows for record in _records(row)), path)
+    return write_table(_HEAD, (record for row in rows for record in _records(row)), path)
 
 
 def _records(row: RobotScores) -> Iterator[list[object]]:

@@ -29,15 +29,17 @@ def print_summary(evaluations: Sequence[Evaluation], console: Console) -> None:
 def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column], worst: bool = False) -> Table:
     """Median over the episodes of every cell that did not fail, failures beside them.
 
-    Args: evaluations: The cells, of one environment. columns: Metrics to show. worst: Whether the
-        episode that is farthest from zero stands in brackets, where there are several.
+    Args:
+        evaluations: The cells, of one environment.
+        columns: Metrics to show.
+        worst: Whether the episode that is farthest from zero stands in brackets, where there are several.
     """
     known = evaluations[0].condition.environment
     swept = list(dict.fromkeys(name for e in evaluations for name in e.condition.swept))
     judged = {column.metric for column in known.judged}
     heads = [Head(name, is_number=False) for name in ("reference", "scenario", "policy")]
     heads += [Head(name) for name in swept]
-    heads += [Head(c.title, c.unit, leaves=2 if c.metric in judged else 1) for c in columns]
+    heads += [Head(c.title, c.unit, c.note, leaves=2 if c.metric in judged else 1) for c in columns]
     heads += [Head(known.failure)]
     rows = []
     for e in evaluations:
@@ -47,7 +49,7 @@ def summary_table(evaluations: Sequence[Evaluation], columns: Sequence[Column], 
         figures = [_median(e, column, worst) for column in columns]
         rows.append(Row((*names, *values, *figures, f"{e.num_failed}/{len(e.episodes)}")))
     title = f"{known.subject}, median over episodes"
-    return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=_legend(known, columns))
+    return Table(tuple(heads), tuple(rows), keys=3, title=title, caption=known.note)
 
 
 def _median(evaluation: Evaluation, column: Column, worst: bool) -> str:
@@ -113,6 +115,6 @@ def _parts(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def _legend(known: Environment, columns: Sequence[Column]) -> str:
-    """What the titles of the columns that are shown leave open."""
+    """Notes on the titles of the columns that are shown."""
     notes = "; ".join(f"{column.title}: {column.note}" for column in columns if column.note)
     return " ".join(sentence for sentence in (notes and f"{notes}.", known.note) if sentence)
