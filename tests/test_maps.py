@@ -15,12 +15,12 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.runtime.scenario import make_scenario
 from tests.cells import METRIC, cell, family
+from train.commands.compare import CompareConfig
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, varied
 from train.evaluate.evaluate import Evaluation, make_vector_env
 from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
 from train.evaluate.statistics import Estimate
-from train.experiments.compare import CompareConfig
 from train.figures.figures import draw_maps
 from train.figures.map_plots import Square, blended, panels
 from train.report import Results, write_report

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
-from train.experiments.compare import recorded
+from train.commands.compare import recorded
 from train.learn.run_training import resume
 from train.runs.folders import free_folder, locked, new_run, require_run
 

@@ -29,10 +29,10 @@ from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
 from elastic_env.core.state import Stateful
+from train.commands.bench import BenchCase
 from train.commands.cli import main
 from train.evaluate.evaluate import evaluate, make_vector_env
 from train.evaluate.progress import read_progress
-from train.experiments.bench import BenchCase
 from train.learn.constant_search import ConstantSearch
 from train.learn.curves import Curves
 from train.learn.mixed_env import MixedVectorEnv, threads_of_each
@@ -44,7 +44,7 @@ from train.learn.state import read_state, write_state
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Training
 from train.runs.folders import locked
-from train.workers.places import Place
+from train.workers.executors import Executors
 
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
@@ -597,8 +597,10 @@ def test_several_configurations_are_trained_in_one_pool(
 ) -> None:
     """Catches configurations that wait for one another, a seed in the folder of another, a resume of one alone."""
     monkeypatch.chdir(tmp_path)
-    pools, opened = list[int](), Place.opened
-    monkeypatch.setattr(Place, "opened", lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder))
+    pools, opened = list[int](), Executors.open
+    monkeypatch.setattr(
+        Executors, "open", lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder)
+    )
     configs = {name: {"name": name, **SMALL, **PPO, "base": base} for name, base in (("a", "input"), ("b", "dynamic"))}
     for name, config in configs.items():
         Path(f"{name}.yaml").write_text(yaml.safe_dump(config))

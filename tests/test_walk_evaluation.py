@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from PIL import Image
 from rich.console import Console
 
-import train.experiments.compare
+import train.commands.compare
 from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.config import load_yaml
@@ -23,10 +23,10 @@ from elastic_env.dynamics.leg_kinematics import rotation_x, rotation_y
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.runtime.robot_model import WalkerModel
 from train.commands.cli import main
+from train.commands.compare import CompareConfig, try_out
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import Evaluation, evaluate, make_vector_env
 from train.evaluate.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
-from train.experiments.compare import CompareConfig, try_out
 from train.figures.figures import figure_name, option_curves, reference_curves
 from train.figures.sweep_plots import draw_sweep
 from train.figures.walk_plots import draw_pelvis, draw_zmp, intervals
@@ -41,7 +41,7 @@ CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 TRAININGS = [path for path in CONFIGS if path.stem.startswith("train_")]
 COMPARISONS = [path for path in CONFIGS if path not in TRAININGS and path.stem != "bench"]
 HIP_ROLL = 1
-"""Place of the hip roll joint in a leg of six."""
+"""Executors of the hip roll joint in a leg of six."""
 
 
 def walk(policy: str = "zero", reference: Any = None, **values: Any) -> Condition:
@@ -71,7 +71,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """What is wrong with the parameters of a model, in sentences that name each as its user wrote it."""
 
 import itertools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -174,11 +175,13 @@ def _number(bound: float) -> str:
 
 
 def _meaning(model: type[BaseModel], path: ParameterPath) -> str:
-    """What a parameter is, in brackets; empty where its description is more than one line."""
+    """The first sentence of a quantity's description, in brackets and without its unit."""
     field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
     if field is None or not field.description or not isinstance(field.json_schema_extra, dict):
         return ""
-    return f" ({field.description.rpartition(' [')[0]})"
+    unit = f" [{field.json_schema_extra['unit']}]"
+    sentence = re.split(r"[.;] |\.$", " ".join(field.description.split()), maxsplit=1)[0]
+    return f" ({sentence.removesuffix(unit)})"
 
 
 def _unit(model: type[BaseModel], path: ParameterPath) -> str:

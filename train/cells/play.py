@@ -25,7 +25,7 @@ from train.runs.failures import DEFECT, explained
 from train.runs.progress import Show, plain_progress, show_progress
 from train.runs.warned import each_once, said_so_far
 from train.workers.calls import Outcome, Tally, Watch, run_calls
-from train.workers.places import HERE, Place
+from train.workers.executors import LOCAL_EXECUTORS, Executors
 
 _MOST_NAMED = 5
 """Cells that one line names."""
@@ -45,7 +45,7 @@ class CellsFailedError(ElasticError):
 
 
 def run_conditions(
-    conditions: Sequence[Condition], console: Console, place: Place = HERE, store: Store | None = None,
+    conditions: Sequence[Condition], console: Console, place: Executors = LOCAL_EXECUTORS, store: Store | None = None,
     fresh: bool = False,
 ) -> list[Evaluation]:  # fmt: skip
     """Evaluate conditions, the long ones first, and return their results in the order given.
@@ -103,7 +103,9 @@ def _kept(conditions: Sequence[Condition], store: Store, console: Console) -> li
 class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
-    def __init__(self, conditions: Sequence[Condition], console: Console, place: Place, store: Store | None) -> None:
+    def __init__(
+        self, conditions: Sequence[Condition], console: Console, place: Executors, store: Store | None
+    ) -> None:
         self._conditions, self._console, self._place, self._store = conditions, console, place, store
         steps = num_steps(conditions)
         cores = (place.jobs or os.cpu_count() or 1) if place.is_local else len(conditions)
@@ -135,7 +137,7 @@ class _Playing:
         watch = Watch(self._reported, self._ended, moved=self._moved)
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
-            with self._place.opened(len(self._batches), folder) as pool:
+            with self._place.open(len(self._batches), folder) as pool:
                 said = said_so_far()
                 given = [(self._of(batch), said) for batch in range(len(self._batches))]
                 run_calls(_evaluate_beside, given, pool, watch)

@@ -20,9 +20,9 @@ from train.runs.folders import locked, locked_part, require_name, require_run, r
 from train.runs.progress import Show, show_progress
 from train.runs.user_code import code_refused, require_no_code
 from train.workers.calls import Outcome, Tally, Watch, run_calls
-from train.workers.places import Place
+from train.workers.executors import Executors
 
-ONE_BY_ONE = Place(jobs=1)
+ONE_BY_ONE = Executors(jobs=1)
 """Seeds in turn, in this process, with all cores for the physics of each."""
 _PATIENCE_S = 60.0
 """How long the program that works on a training seed is waited for."""
@@ -41,7 +41,7 @@ class Run:
 
 
 def start(
-    configs: Sequence[TrainConfig], console: Console, output: Path | None = None, place: Place = ONE_BY_ONE
+    configs: Sequence[TrainConfig], console: Console, output: Path | None = None, executors: Executors = ONE_BY_ONE
 ) -> list[Path]:
     """Train all seeds of some configurations, each in a new run.
 
@@ -50,7 +50,7 @@ def start(
         console: Where progress and results go.
         output: Folder, new or empty; of several configurations each has a folder in it by its name. Default
             runs/<name>, numbered if taken.
-        place: Where seeds are trained, and how many at a time; the weights do not depend on it.
+        executors: Where seeds are trained, and how many at a time; the weights do not depend on it.
 
     Returns:
         The runs' folders; there is none where nothing could begin.
@@ -66,19 +66,19 @@ def start(
             made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
             runs.append(Run(config, held.enter_context(made)))
             held.enter_context(locked(runs[-1].folder))
-        _train(runs, console, place)
+        _train(runs, console, executors)
     return [run.folder for run in runs]
 
 
 def resume(
-    folders: Sequence[Path], console: Console, place: Place = ONE_BY_ONE, trust_code: bool = False
+    folders: Sequence[Path], console: Console, executors: Executors = ONE_BY_ONE, trust_code: bool = False
 ) -> list[Path]:
     """Go on with runs that were interrupted or killed; seeds that are complete stay as they are.
 
     Args:
         folders: Of the runs.
         console: Where progress and results go.
-        place: Where seeds are trained, and how many at a time.
+        executors: Where seeds are trained, and how many at a time.
         trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may lie in a folder.
 
     Raises:
@@ -88,7 +88,7 @@ def resume(
     with ExitStack() as held:
         for run in runs:
             held.enter_context(locked(run.folder))
-        _train(runs, console, place)
+        _train(runs, console, executors)
     return [run.folder for run in runs]
 
 
@@ -103,7 +103,7 @@ def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
     return config
 
 
-def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
+def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     for run in runs:
         if run.lacks():
             console.print(f"training in {run.folder}; if it stops: elastic train --resume {run.folder}", soft_wrap=True)
@@ -113,11 +113,11 @@ def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
     calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
     totals = {call.name: call.run.config.decisions for call in calls}
     with show_progress(console, totals, unit="decisions") as show:
-        if place == ONE_BY_ONE:
+        if executors == ONE_BY_ONE:
             for number, call in enumerate(calls):
                 _train_seed(call.run.config, call.seed, call.run.folder, 0, partial(show, number))
         else:
-            _train_beside(calls, console, place, show)
+            _train_beside(calls, console, executors, show)
     for run in runs:
         console.print(_table(run.config, run.folder))
 
@@ -136,7 +136,7 @@ class _Call:
         return f"{self.run.folder.name}, seed {self.seed}" if self.is_one_of_several else f"seed {self.seed}"
 
 
-def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: Show) -> None:
+def _train_beside(calls: Sequence[_Call], console: Console, executors: Executors, show: Show) -> None:
     """Train seeds beside each other: they share the cores among them.
 
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
@@ -154,10 +154,10 @@ def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: 
     def moved(number: int) -> None:
         console.print(f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True)
 
-    threads = place.threads_per_call(len(calls))
+    threads = executors.threads_per_call(len(calls))
     given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
     watch = Watch(reported=report, tallied=tallied, moved=moved)
-    with place.opened(len(given), calls[0].run.folder) as pool:
+    with executors.open(len(given), calls[0].run.folder) as pool:
         outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
     _raise_first(calls, outcomes)
 

@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, prefer_realtime
 from train.evaluate.conditions import Condition, PolicySpec
@@ -21,15 +20,6 @@ from train.evaluate.evaluate import blamed, make_policy
 from train.runs.folders import run_folder
 
 _PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
-
-
-class RealTimeConfig(Model):
-    """What `elastic speed --real-time` plays."""
-
-    env: str = "walker"
-    policy: str | None = None
-    """Policy that is timed; None for adaptive_posture on the walker, input on the testbed."""
-    seconds: float = quantity("s", 60.0, gt=0.0, le=86_400.0, description="how long it is played against the clock")
 
 
 @dataclass(frozen=True)
@@ -74,25 +64,30 @@ class RealTimeResult:
     policy_max_us: float
 
 
-def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
+def play_against_the_clock(env_name: str, policy_name: str | None, seconds: float) -> RealTimeResult:
     """Record what the policy observes in an episode, then call it with that once in every control period.
 
     The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells whether it has it.
 
     The episode begins again, with a policy that remembers nothing, where it is shorter than what is to be played.
 
+    Args:
+        env_name: Environment.
+        policy_name: Policy that is timed; None for adaptive_posture on the walker, input on the testbed.
+        seconds: How long it is played against the clock [s].
+
     Raises:
         ConfigurationError: Environment or policy does not exist.
         PolicyFailedError: The policy failed.
     """
-    known = environment(config.env)
-    name = config.policy or known.live_policy or known.looped_policy
-    condition = Condition(env=config.env, policy=PolicySpec(name=name), reference=known.default_reference)
+    known = environment(env_name)
+    name = policy_name or known.live_policy or known.looped_policy
+    condition = Condition(env=env_name, policy=PolicySpec(name=name), reference=known.default_reference)
     env = gymnasium.make(condition.environment.id, **condition.arguments)
     try:
         policy = make_policy(condition.policy, env)
         period_s = env.unwrapped.assumed_model.control_period_s  # type: ignore[attr-defined]
-        cycles = max(round(config.seconds / period_s), 1)
+        cycles = max(round(seconds / period_s), 1)
         with blamed(condition):
             observations = _recorded(env, policy, cycles)
             is_real_time = prefer_realtime(Priority.LOOP)
@@ -102,7 +97,7 @@ def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
                 give_up_realtime()
     finally:
         env.close()
-    return summary(config.env, name, period_s, latency_s, policy_s, is_real_time=is_real_time)
+    return summary(env_name, name, period_s, latency_s, policy_s, is_real_time=is_real_time)
 
 
 def _recorded(env: Any, policy: Any, most: int) -> list[Any]:
@@ -159,11 +154,15 @@ def summary(
     )  # fmt: skip
 
 
-def measure_real_time(config: RealTimeConfig, console: Console, output: Path | None = None) -> Path:
+def measure_real_time(
+    env: str, policy: str | None, seconds: float, console: Console, output: Path | None = None
+) -> Path:
     """Play, print the latencies, and write them as JSON.
 
     Args:
-        config: What to play.
+        env: Environment.
+        policy: Policy that is timed; None for the environment's own.
+        seconds: How long it is played [s].
         console: Where the table goes.
         output: Folder for the result; default runs/speed, numbered if taken.
 
@@ -175,9 +174,9 @@ def measure_real_time(config: RealTimeConfig, console: Console, output: Path | N
         PolicyFailedError: The policy failed.
         ResultsExistError: The output folder holds results.
     """
-    with run_folder("speed", config.model_dump(mode="json"), 0, output) as folder:
-        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
-        result = play_against_the_clock(config)
+    with run_folder("speed", {"env": env, "policy": policy, "seconds": seconds}, 0, output) as folder:
+        console.print(f"recording an episode, then {seconds:g} s against the clock")
+        result = play_against_the_clock(env, policy, seconds)
         path = folder / "real_time.json"
         path.write_text(json.dumps(asdict(result), indent=2) + "\n")
     console.print(_table(result))

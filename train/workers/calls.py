@@ -43,7 +43,7 @@ class WorkerKilledError(SystemFailedError):
         )
 
 
-class PlaceLostError(SystemFailedError):
+class ExecutorLostError(SystemFailedError):
     """What runs the calls is gone: the scheduler of a cluster."""
 
 
@@ -168,7 +168,7 @@ def run_calls(
 
     Raises:
         VersionsDifferError: A machine has other versions.
-        PlaceLostError: The executor is gone.
+        ExecutorLostError: The executor is gone.
         UnguardedScriptError: Workers cannot import the script that runs here.
         KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
     """
@@ -210,7 +210,7 @@ class _Run:
         try:
             future = self._pool.executor.submit(carried_out, *given)
         except RuntimeError as error:  # it was shut down
-            raise PlaceLostError(f"the workers are gone: {error}") from None
+            raise ExecutorLostError(f"the workers are gone: {error}") from None
         self._futures[future] = number
         future.add_done_callback(self._pool.events.put)
 
@@ -234,7 +234,7 @@ class _Run:
     def _end(self, number: int, future: Future[Any]) -> None:
         self._running.discard(number)
         outcome = _outcome(future)
-        if isinstance(outcome.error, VersionsDifferError | PlaceLostError | UnguardedScriptError):
+        if isinstance(outcome.error, VersionsDifferError | ExecutorLostError | UnguardedScriptError):
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
             if self._is_ending:
@@ -282,7 +282,7 @@ def _portable(error: Exception) -> Exception:
 
 def _outcome(future: Future[Any]) -> Outcome:
     if future.cancelled():
-        return Outcome(error=PlaceLostError("the workers are gone: they dropped what was to be done"))
+        return Outcome(error=ExecutorLostError("the workers are gone: they dropped what was to be done"))
     error = future.exception()
     if error is None:
         return future.result()

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, missing_extra
-from train.workers.calls import MOST_MOVES, PlaceLostError, Pool, WorkerKilledError
+from train.workers.calls import MOST_MOVES, ExecutorLostError, Pool, WorkerKilledError
 from train.workers.versions import everything, require_same
 
 _CONNECT_S = 10
@@ -138,7 +138,7 @@ class _Cluster(Executor):
             if ours.set_running_or_notify_cancel():
                 ours.set_result(future.result())
         except CancelledError:
-            ours.set_exception(PlaceLostError("the dask scheduler is gone, or it has dropped the calls"))
+            ours.set_exception(ExecutorLostError("the dask scheduler is gone, or it has dropped the calls"))
         except Exception as error:
             lost = type(error).__name__ == "KilledWorker"
             ours.set_exception(WorkerKilledError() if lost else error)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import SystemFailedError, missing_extra
-from train.workers.calls import PlaceLostError, Pool, WorkerLostError
+from train.workers.calls import ExecutorLostError, Pool, WorkerLostError
 
 _POLL_S = 0.5
 
@@ -159,10 +159,10 @@ class Jobs(Executor):
         """Slurm refuses, or the folder is full: that is the end of all calls."""
         for future in self._jobs:
             if not future.cancelled():
-                future.set_exception(PlaceLostError(f"the jobs cannot be followed: {error}"))
+                future.set_exception(ExecutorLostError(f"the jobs cannot be followed: {error}"))
         with suppress(queue.Empty):
             while True:
-                self._waiting.get_nowait()[0].set_exception(PlaceLostError(f"no job can be submitted: {error}"))
+                self._waiting.get_nowait()[0].set_exception(ExecutorLostError(f"no job can be submitted: {error}"))
 
 
 def _settle(future: "Future[Any]", job: Any) -> None:

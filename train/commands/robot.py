@@ -6,9 +6,10 @@ Its folder holds the robot's file, a comparison with report, a picture, and the 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 import yaml
 from pydantic import Field
 from rich import box
@@ -27,11 +28,12 @@ from elastic_env.rendering.sag import ENLARGED, SagViews
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import RobotConfig, configure_robot
 from elastic_env.runtime.joint_task import JointPlant
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec
+from train.commands.compare import CompareConfig, compare
+from train.commands.options import Motion, StiffnessOrFile
+from train.commands.play import play
+from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.evaluate import Evaluation
 from train.evaluate.robot_file import ENDINGS, read_robot_file
-from train.experiments.compare import CompareConfig, compare
-from train.experiments.play import play
 from train.figures import plots
 from train.report import require_jinja2, require_plotly
 from train.runs.escaping import write_records
@@ -44,20 +46,46 @@ _TIP = "tip"
 _PIXELS, _POSES_SHOWN = 420, 2
 
 
-class RobotTrial(Model):
-    """What `elastic robot` does."""
+class Robot(Model):
+    """Try a robot of your own: make its joints elastic, play it with and without compensation, and say what it gains.
 
-    model: Locator
-    """File of MJCF or URDF, a file of a robot (.yaml), or a name of the gallery."""
-    stiffness: Locator | float | None = None
-    """File of the elastic joints, or one K of all hinges [N·m/rad]."""
+    Plays static poses and a motion with the policies uncompensated, input and dynamic, in the scenario nominal: with
+    friction and encoders as the joints file has them. Prints the error of the end effector [mm], and how much of it
+    comes from each joint. The folder has robot.yaml (for --env of the other commands), joints.yaml, picture.png,
+    end_effector.csv, joints.csv, and a comparison with report.html.
+
+    Example: elastic robot arm.urdf --stiffness joints.yaml --end-effector tool0
+
+    Example, one K for all hinges: elastic robot arm.xml --stiffness 1000
+
+    Example, an arm of the gallery (extra robots): elastic robot panda
+    """
+
+    model: Annotated[Locator, tyro.conf.Positional]
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, ROBOT.yaml (a file of a robot, see
+    docs/robots.md), or a name of the gallery, such as panda, ur5, xarm7, so101."""
+    stiffness: StiffnessOrFile = None
+    """YAML file of the elastic joints, or one K of all hinges [N·m/rad]. Has no default, as K is a property of your
+    robot; elastic identify --robot finds it. K of the gallery is assumed."""
     end_effector: Locator | None = None
-    """Site or body that is placed."""
-    poses: Poses = Poses(positions=4)
+    """Site or body that is to be placed; default that of the robot's file or of the gallery, or the outermost body."""
+    poses: Annotated[Poses, tyro.conf.Suppress] = Poses(positions=4)
     """Static poses; fewer than an environment plays, for a result within a minute."""
-    motion: GivenReference = Field(default={"kind": "moves", "positions": 4})
-    """Motion that is played beside the static poses."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the episodes")
+    motion: Motion = Field(default={"kind": "moves", "positions": 4})
+    """Motion beside the static poses: moves, line, circle, sine, multisine, or a mapping of kind and parameters."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED)
+    """Seed of the episodes."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/robot, numbered if taken."""
+    video: bool = False
+    """Film the motion, uncompensated and with input. Off by default: a second of motion is 50 frames to draw."""
+
+    def run(self, console: Console) -> None:
+        """Play, write, print."""
+        result = try_robot(self, console)
+        console.print(f"Results in {result.folder}:", soft_wrap=True)
+        for path in result.files:
+            console.print(f"  {path}", soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -112,14 +140,12 @@ class RobotResult:
     files: list[Path]
 
 
-def try_robot(trial: RobotTrial, console: Console, output: Path | None = None, video: bool = False) -> RobotResult:
+def try_robot(trial: Robot, console: Console) -> RobotResult:
     """Make a robot elastic, play it with every policy, write its folder, and print its tables.
 
     Args:
         trial: The robot and its motion.
         console: Where progress and tables go.
-        output: Folder for the results; default runs/robot, numbered if taken.
-        video: Whether the motion is filmed, without and with `input`.
 
     Raises:
         ConfigurationError: The model, its joints or the motion cannot be used; found before a folder is made.
@@ -138,7 +164,8 @@ def try_robot(trial: RobotTrial, console: Console, output: Path | None = None, v
     plant = config.robot.plant(config)
     if trial.stiffness is None and trial.model in GALLERY:
         console.print(f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness")
-    with run_folder("robot", trial.model_dump(mode="json"), trial.seed, output) as folder:
+    recorded = trial.model_dump(mode="json", exclude={"output", "video"})
+    with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
         comparison = compare(_comparison(trial, file), console, folder / "comparison")
         placed, shares = [_placed(one) for one in comparison.evaluations], joint_shares(plant)
@@ -148,14 +175,14 @@ def try_robot(trial: RobotTrial, console: Console, output: Path | None = None, v
             write_records([asdict(one) for one in placed], folder / "end_effector.csv"),
             write_records([asdict(one) for one in shares], folder / "joints.csv"),
             *_pictures(config, plant, folder, console),
-            *(_films(trial, file, folder, console) if video else []),
+            *(_films(trial, file, folder, console) if trial.video else []),
         ]
     for table in (_placed_table(placed), _shares_table(shares)):
         console.print(table)
     return RobotResult(folder, placed, shares, files)
 
 
-def robot_arguments(trial: RobotTrial) -> dict[str, Any]:
+def robot_arguments(trial: Robot) -> dict[str, Any]:
     """Arguments of `elastic_env/Robot-v0`, without reference and scenario.
 
     Raises:
@@ -239,7 +266,7 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
     return folder / "robot.yaml"
 
 
-def _comparison(trial: RobotTrial, file: Path) -> CompareConfig:
+def _comparison(trial: Robot, file: Path) -> CompareConfig:
     references = [trial.poses.model_dump(mode="json"), trial.motion]
     return CompareConfig(
         name="robot", env=str(file), references=references, scenarios=[SCENARIO],
@@ -342,7 +369,7 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
     return np.concatenate(rows)
 
 
-def _films(trial: RobotTrial, file: Path, folder: Path, console: Console) -> list[Path]:
+def _films(trial: Robot, file: Path, folder: Path, console: Console) -> list[Path]:
     """The motion without and with `input`."""
     films = []
     for policy in POLICIES[:2]:

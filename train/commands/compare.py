@@ -1,11 +1,12 @@
-"""Policies × scenarios × references × seeds under one protocol: one tidy CSV, a summary table, figures."""
+"""`elastic compare`: policies × scenarios × references × seeds under one protocol."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self, cast
 
+import tyro
 from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
@@ -14,6 +15,7 @@ from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, lo
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shown
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
+from train.commands.options import OnHardware
 from train.evaluate.changes import changes, merged
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import Environment, Reference, environment
@@ -22,7 +24,6 @@ from train.evaluate.families import expand
 from train.evaluate.leaderboard import standings
 from train.evaluate.maps import MapConfig, heat_maps
 from train.evaluate.robots import robot_scores
-from train.experiments.timing import step_times
 from train.figures import plots
 from train.figures.figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
@@ -34,7 +35,8 @@ from train.runs.folders import describe, locked, require_run, run_folder
 from train.runs.kinds import is_a
 from train.runs.user_code import code_refused, require_no_code
 from train.runs.warned import each_once
-from train.workers.places import HERE, Place
+from train.speed.step_times import step_times
+from train.workers.executors import LOCAL_EXECUTORS, Executors
 
 _MOST_CELLS = 10_000
 
@@ -227,12 +229,12 @@ class Work:
     """How a comparison is played.
 
     Attributes:
-        place: Where its cells are played.
+        executors: Where its cells are played.
         resumes: Whether the output folder is a run that is gone on with.
         fresh: Whether cells that it keeps are played again.
     """
 
-    place: Place = HERE
+    executors: Executors = LOCAL_EXECUTORS
     resumes: bool = False
     fresh: bool = False
 
@@ -336,7 +338,7 @@ def _played(
     store = Store(folder / CELLS) if keeps else None
     go_on = f"go on with: elastic compare --resume {folder}"
     try:
-        return run_conditions(conditions, console, work.place, store, work.fresh)
+        return run_conditions(conditions, console, work.executors, store, work.fresh)
     except CellsFailedError as error:
         if error.finished:
             write_summary(merged(error.finished), folder / "summary.md")
@@ -394,3 +396,70 @@ def _parameters(reference: Reference, known: Environment) -> list[str]:
     if not isinstance(reference, dict):
         return []
     return [f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)]
+
+
+class Compare(Model):
+    """Compare policies × scenarios × references × seeds as a configuration says.
+
+    Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts and tables, works
+    offline), report.md, summary.md and figures beside the resolved configuration, seed, versions and commit.
+
+    A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all training seeds of a
+    residual, compared with their base on the same episodes, with intervals over training seeds. The base is added if
+    it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of the package.
+
+    Example, one joint: elastic compare configs/testbed.yaml
+
+    Example, the paper's walks: elastic compare configs/paper.yaml
+
+    Example, trained residuals: elastic compare configs/learned_testbed.yaml
+
+    Example, all policies in tracks by what they need: elastic compare configs/leaderboard.yaml
+
+    Example, heat maps over two axes: elastic compare configs/map_payload_slope.yaml
+    """
+
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """YAML configuration, see configs/; with --resume the one of the run unless another is named."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
+    jobs: int = 0
+    """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
+    on: str = "local"
+    """Where they run: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    resume: Path | None = None
+    """Folder of a run to go on with: what is missing or has changed is played."""
+    fresh: bool = False
+    """With --resume: play all cells again."""
+    trust_code: bool = False
+    """With --resume and no configuration: run the code that the run's own names."""
+    hardware: OnHardware = OnHardware()
+
+    def run(self, console: Console) -> None:
+        """Compare."""
+        self._require()
+        if self.config is not None:
+            config = load_yaml(self.config, CompareConfig)
+        else:
+            config = recorded(cast(Path, self.resume), self.trust_code)
+        if self.hardware.arguments:
+            real = self.hardware.environment(config.env)
+            real["env_options"] = {**config.env_options, **real["env_options"]}
+            config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
+        work = Work(Executors(self.on, self.jobs), self.resume is not None, self.fresh)
+        print_files(compare(config, console, self.resume or self.output, work), console)
+
+    def _require(self) -> None:
+        if self.config is None and self.resume is None:
+            raise ConfigurationError("name a configuration or, with --resume, the run to go on with")
+        if self.resume is not None and self.output is not None:
+            raise ConfigurationError("a run goes on in its own folder: --resume takes no --output")
+        if self.resume is None and self.fresh:
+            raise ConfigurationError("--fresh needs --resume; a new run plays all of its cells")
+
+
+def print_files(comparison: Comparison, console: Console) -> None:
+    """Say what a comparison wrote."""
+    console.print(f"Results in {comparison.folder}:", soft_wrap=True)
+    for path in comparison.files:
+        console.print(f"  {path}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""The paper's experiments in short: identification (Fig. 5), compensation (Fig. 6), a motion, walks (Figs. 7 to 10)."""
+"""`elastic demo`: the paper's identification, compensation, a motion and walks (Figs. 5 to 10) in short."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +10,11 @@ from rich.table import Table
 
 import baselines.identification.identify as identification
 from baselines.compensation.gravity_torque import make_gravity
+from elastic_env.core.config import Model
 from train.cells.play import run_conditions
+from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.evaluate import Evaluation, make_vector_env
-from train.experiments.compare import CompareConfig
 from train.figures import plots
 from train.figures.figures import cells, draw_figure
 from train.figures.testbed_plots import draw_identification, draw_static_errors, draw_time_series, static_errors
@@ -60,41 +61,53 @@ _SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its b
 )
 
 
-def demo(console: Console, output: Path | None = None) -> None:
-    """Run, print the tables beside the paper's figures, and say where the pictures are."""
-    plots.require_matplotlib()
-    walking = [*_SLOW_WALK.conditions(), *_WALK.conditions(), *_SOFT_WALK.conditions()]
-    parts = [_STATIC.conditions(), _MOTION.conditions(), walking]
-    conditions = [condition for part in parts for condition in part]
-    with run_folder("demo", {"conditions": [c.model_dump(mode="json") for c in conditions]}, 0, output) as folder:
-        console.print(
-            "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic gear and a pendulum of "
-            "60 N·m, and a humanoid that walks in place on twelve of them; at the end with joints that are softer than "
-            "assumed (scenario soft)"
-        )
-        evaluations = iter(run_conditions(conditions, console))
-        static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
-        model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
-        points = static[0].points
-        assert points is not None
-        result = identification.identify_points(points, [make_gravity(model)])
-        result.save(folder / "identification.json")
-        files = [
-            draw_identification(result, points, [model], folder / "fig5_identification.png"),
-            draw_static_errors(static, model, folder / "fig6_static_errors.png"),
-            draw_time_series(motion, folder / "sine.png"),
-            *(file for name in ("pelvis", "zmp") for walk in cells(walks) for file in draw_figure(name, walk, folder)),
-            folder / "identification.json",
-            write_episodes([*motion, *walks], folder / "episodes.csv"),
-            write_summary([*motion, *walks], folder / "summary.md"),
-        ]
-    console.print(_testbed_table(result, static), "")
-    print_summary(motion, console)
-    console.print("", _walk_table(walks), "")
-    print_summary(walks, console)
-    console.print("Figures and data:")
-    for path in files:
-        console.print(f"  {path}", soft_wrap=True)
+class Demo(Model):
+    """The paper's experiments in short, on testbed and walker, in some minutes, with pictures."""
+
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/demo, numbered if taken."""
+
+    def run(self, console: Console) -> None:
+        """Run, print the tables beside the paper's figures, and say where the pictures are."""
+        plots.require_matplotlib()
+        walking = [*_SLOW_WALK.conditions(), *_WALK.conditions(), *_SOFT_WALK.conditions()]
+        parts = [_STATIC.conditions(), _MOTION.conditions(), walking]
+        conditions = [condition for part in parts for condition in part]
+        recorded = {"conditions": [condition.model_dump(mode="json") for condition in conditions]}
+        with run_folder("demo", recorded, 0, self.output) as folder:
+            console.print(
+                "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic gear and a "
+                "pendulum of 60 N·m, and a humanoid that walks in place on twelve of them; at the end with joints "
+                "that are softer than assumed (scenario soft)"
+            )
+            evaluations = iter(run_conditions(conditions, console))
+            static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
+            model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
+            points = static[0].points
+            assert points is not None
+            result = identification.identify_points(points, [make_gravity(model)])
+            result.save(folder / "identification.json")
+            files = [
+                draw_identification(result, points, [model], folder / "fig5_identification.png"),
+                draw_static_errors(static, model, folder / "fig6_static_errors.png"),
+                draw_time_series(motion, folder / "sine.png"),
+                *(
+                    file
+                    for name in ("pelvis", "zmp")
+                    for walk in cells(walks)
+                    for file in draw_figure(name, walk, folder)
+                ),
+                folder / "identification.json",
+                write_episodes([*motion, *walks], folder / "episodes.csv"),
+                write_summary([*motion, *walks], folder / "summary.md"),
+            ]
+        console.print(_testbed_table(result, static), "")
+        print_summary(motion, console)
+        console.print("", _walk_table(walks), "")
+        print_summary(walks, console)
+        console.print("Figures and data:")
+        for path in files:
+            console.print(f"  {path}", soft_wrap=True)
 
 
 def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:

@@ -1,4 +1,4 @@
-"""An episode in MuJoCo's web viewer: reference, motor side and link side, side by side."""
+"""`elastic view`: an episode in MuJoCo's web viewer: reference, motor side and link side, side by side."""
 
 import bisect
 import contextlib
@@ -22,10 +22,10 @@ from rich.console import Console
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
+from train.commands.play import WatchedEpisode, episode, steps_within
+from train.commands.view_proxy import LOOPBACK, Access, Proxy, listen
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import make_policy
-from train.experiments.play import episode, steps_within
-from train.experiments.view_proxy import LOOPBACK, Access, Proxy, listen
 
 FIRST_FACTOR, LARGEST_FACTOR = 3.0, 20.0
 """Factors of the slider: the one at the start, and its end."""
@@ -240,37 +240,40 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
     return handle
 
 
-@dataclass(frozen=True)
-class PageOptions:
-    """Where and how long a page shows an episode.
+class View(WatchedEpisode):
+    """Look at one episode in the browser: reference, motor side and link side of the robot, side by side.
 
-    Attributes:
-        host: Address or name of this machine at which it listens.
-        port: Its port; 0 takes the first free one from 8080 on.
-        max_s: How much of the episode it shows [s]; None for all.
+    The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C. Sliders set the time,
+    and the factor by which deviations from the reference are enlarged. The page is reached from this machine alone, at
+    the address that is printed, with its token; from elsewhere by: ssh -L 8080:127.0.0.1:8080 MACHINE
+
+    Example, one joint: elastic view --policy input --reference sine
+
+    Example, a walk: elastic view --env walker --policy input_output --scenario soft
     """
 
     host: str = LOOPBACK
+    """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others reach it too."""
     port: int = 0
-    max_s: float | None = None
+    """Port of the page; 0 takes the first free one from 8080 on."""
 
-
-def view(condition: Condition, console: Console, options: PageOptions) -> None:
-    """Play an episode, then show it until Ctrl-C."""
-    listen(options.host, options.port).close()  # what cannot be is said before the episode
-    console.print(f"playing {condition.policy.title} first", soft_wrap=True)
-    recording = record(condition, console, options.max_s)
-    with show(recording, options.host, options.port) as page:
-        console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False, markup=False)
-        if not page.access.is_local:
-            console.print(
-                "who has this address sees the page and moves its sliders; nothing on the way is encrypted",
-                soft_wrap=True,
-            )
-        console.print("Ctrl-C ends it", soft_wrap=True)
-        _open_tab(page.access.address)
-        while page.handle.is_running():
-            page.handle.sync()
+    def run(self, console: Console) -> None:
+        """Play an episode, then show it until Ctrl-C."""
+        listen(self.host, self.port).close()  # what cannot be is said before the episode
+        condition = self.condition
+        console.print(f"playing {self.policy} first", soft_wrap=True)
+        recording = record(condition, console, self.max_s)
+        with show(recording, self.host, self.port) as page:
+            console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False)
+            if not page.access.is_local:
+                console.print(
+                    "who has this address sees the page and moves its sliders; nothing on the way is encrypted",
+                    soft_wrap=True,
+                )
+            console.print("Ctrl-C ends it", soft_wrap=True)
+            _open_tab(page.access.address)
+            while page.handle.is_running():
+                page.handle.sync()
 
 
 def _open_tab(address: str) -> None:

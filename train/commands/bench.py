@@ -2,11 +2,13 @@
 
 import json
 import os
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 import yaml
 from pydantic import Field, model_validator
 from rich import box
@@ -220,3 +222,23 @@ def _table(figures: list[Figure]) -> Table:
 def _markdown(figures: list[Figure]) -> str:
     rules = ["---", "---", "---:", "---:", "---:", "---"]
     return f"## elastic bench\n\n{markdown_table(_COLUMNS, rules, _rows(figures))}\n"
+
+
+class Bench(Model):
+    """Guard figures in CI: short rollouts of both environments against what was accepted.
+
+    Exit code 1, and a line for every figure that falls short. Appends its table to the file that $GITHUB_STEP_SUMMARY
+    names. Example, to accept new figures: elastic bench --update
+    """
+
+    config: Annotated[Path, tyro.conf.Positional] = USUAL
+    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml, that of the package."""
+    update: bool = False
+    """Accept what is measured now: the figures in the configuration change, and nothing else of it."""
+    output: Path | None = None
+    """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
+
+    def run(self, console: Console) -> None:
+        """Play and compare."""
+        if not bench(configuration(self.config, self.update), console, self.update, self.output):
+            sys.exit(1)

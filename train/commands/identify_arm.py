@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Self
 
 import mujoco
 import numpy as np
-from pydantic import model_validator
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -27,8 +25,8 @@ from baselines.identification.pose_plan import (
     plan_poses,
 )
 from baselines.identification.static_arm import StaticArm, hinges_of
-from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
-from elastic_env.core.errors import unknown_name
+from elastic_env.core.config import Locator, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.model_file import compiled_model
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
@@ -43,60 +41,57 @@ _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
 
-class IdentifyArmConfig(Model):
-    """What `elastic identify --robot` does."""
+class ArmOptions(Model):
+    """Options of `elastic identify` for an arm of which there is a log of static poses."""
 
-    robot: Locator
-    """Rigid model of the arm, MJCF or URDF."""
+    robot: Locator | None = None
+    """Rigid model of an arm, MJCF or URDF, in place of the testbed; the options from here on are of an arm."""
     log: Locator | None = None
-    """CSV file of static poses; None to plan the first ones."""
+    """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an IMU or joint torques."""
     joints: tuple[Title, ...] = ()
-    """Names or patterns of the joints whose stiffness is sought; empty for all in the log."""
+    """Names or patterns of the joints whose stiffness is sought; default all in the log. The others are rigid."""
     end_effector: Title | None = None
-    """Site or body that is measured; None for the outermost body."""
+    """Site or body whose position is measured or that carries the IMU; default the outermost body."""
     payload: Title | None = None
-    """Body or site that carries a payload of unknown mass."""
+    """Body or site that carries a payload of unknown mass, which is estimated too."""
     frame: Frame = "offset"
-    """What is known of the measurement's frame."""
+    """Frame of tracker or IMU: known, unknown by an offset, or in pose; for an IMU the last two mean its mounting."""
     measured_by: Kind | None = None
-    """Measurement to use."""
-    within: float = quantity("1", 0.03, gt=0, lt=1, description="half-width of 1/K up to which a joint is told apart")
-    assume: float | None = quantity("N·m/rad", None, gt=0, description="K of joints that are not identified")
-    plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED, description="number of poses to propose")
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the poses from which the plan chooses")
-
-    @model_validator(mode="after")
-    def _something_to_do(self) -> Self:
-        if self.log is None and (not self.plan or self.measured_by is None):
-            raise ValueError(
-                "give the CSV file of static poses by --log, or plan the first poses by --plan 40 --measured-by "
-                "end_effector (or link_encoders, imu, torques)"
-            )
-        return self
+    """Measurement to use, where the log has several or there is no log."""
+    within: float = quantity("1", 0.03, gt=0, lt=1)
+    """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this share."""
+    assume: float | None = quantity("N·m/rad", None, gt=0)
+    """K [N·m/rad] to write for joints that the poses do not tell; default the largest that was identified."""
+    plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED)
+    """Propose so many further poses, within limits and without contacts, that tell the stiffness best."""
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """An arm, its log, and the joints that are sought."""
+    """An arm, its log, the joints that are sought, and how."""
 
+    options: ArmOptions
     arm: StaticArm
     log: PoseLog
     elastic: tuple[str, ...]
+    seed: int
 
-    def model(self, config: IdentifyArmConfig, log: PoseLog | None = None) -> PoseModel:
+    def model(self, log: PoseLog | None = None) -> PoseModel:
         """The poses of a log as a function of the unknowns."""
         own = self.log if log is None else log
-        return PoseModel(self.arm, own, Unknowns.of(own, self.elastic, config.frame, config.payload is not None))
+        has_payload = self.options.payload is not None
+        return PoseModel(self.arm, own, Unknowns.of(own, self.elastic, self.options.frame, has_payload))
 
 
 def run_arm_identification(
-    config: IdentifyArmConfig, console: Console, output: Path | None = None
+    options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
 ) -> ArmIdentification | None:
     """Identify an arm, write `identification.json`, `joints.yaml` and the figure, print the result; or plan.
 
     Args:
-        config: What to do.
+        options: What to do.
         console: Where progress and table go.
+        seed: Seed of the poses from which the plan chooses.
         output: Folder for the results; default runs/identify, numbered if taken.
 
     Returns:
@@ -106,24 +101,33 @@ def run_arm_identification(
         ConfigurationError: Model, log or a name cannot be used.
         ResultsExistError: The output folder holds results.
     """
+    if options.robot is None:
+        raise ConfigurationError("--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)")
+    if options.log is None and (not options.plan or options.measured_by is None):
+        raise ConfigurationError(
+            "give the CSV file of static poses by --log, or plan the first poses by --plan 40 --measured-by "
+            "end_effector (or link_encoders, imu, torques)"
+        )
     plots.require_matplotlib()
-    setting = _setting(config, compiled_model(config.robot), console)
-    with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
-        if config.log is None:
-            _plan_first(config, setting, folder, console)
+    setting = _setting(options, compiled_model(options.robot), console, seed)
+    recorded = {**options.model_dump(mode="json"), "seed": seed}
+    with run_folder("identify", recorded, seed, output) as folder:
+        if options.log is None:
+            _plan_first(setting, folder, console)
             return None
         with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
-            fit = fit_arm(setting.model(config), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
-        plan = plan_further(fit, _candidates(config, setting, console), config.plan) if config.plan else None
-        result = described(fit, config.within, config.assume, None if plan is None else plan.information)
+            fit = fit_arm(setting.model(), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
+        plan = plan_further(fit, _candidates(setting, console), options.plan) if options.plan else None
+        information = None if plan is None else plan.information
+        result = described(fit, options.within, options.assume, information)
         files = result.save(folder)
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
         files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
     console.print(result_table(result))
     for line in [summed_up(fit), *remarks(result, fit)]:
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True, markup=False)
+        console.print(f"wrote {path}", soft_wrap=True)
     return result
 
 
@@ -183,12 +187,12 @@ def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
     ]
 
 
-def _candidates(config: IdentifyArmConfig, setting: _Setting, console: Console) -> PoseLog:
+def _candidates(setting: _Setting, console: Console) -> PoseLog:
     """Poses to choose from; says where contacts of the arm are not known."""
-    shapes = shaped_model(config.robot)
+    shapes = shaped_model(str(setting.options.robot))
     if not (shapes.geom_contype.any() or shapes.geom_conaffinity.any()):
         console.print("the model has no shapes that MuJoCo can read: check the proposed poses for contacts yourself")
-    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(config.seed))
+    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(setting.seed))
 
 
 def shaped_model(path: str) -> mujoco.MjModel:
@@ -200,20 +204,20 @@ def shaped_model(path: str) -> mujoco.MjModel:
     return shaped if set(hinges_of(compiled_model(path))) <= set(hinges_of(shaped)) else compiled_model(path)
 
 
-def _setting(config: IdentifyArmConfig, model: mujoco.MjModel, console: Console) -> _Setting:
+def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed: int) -> _Setting:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
     ranges = {name: _range(model, name) for name in hinges}
-    log = None if config.log is None else read_log(Path(config.log), ranges, config.measured_by)
-    arm = StaticArm(model, hinges if log is None else log.joints, config.end_effector, config.payload)
+    log = None if options.log is None else read_log(Path(options.log), ranges, options.measured_by)
+    arm = StaticArm(model, hinges if log is None else log.joints, options.end_effector, options.payload)
     arm.require_gravity()
     if log is None:
-        log = empty_log(arm, config.measured_by or "end_effector")
-    if config.end_effector is None and log.kind in ("end_effector", "imu"):
+        log = empty_log(arm, options.measured_by or "end_effector")
+    if options.end_effector is None and log.kind in ("end_effector", "imu"):
         console.print(f"measured is taken to be {arm.end_effector!r}; --end-effector names another site or body")
-    setting = _Setting(arm, log, _sought(config.joints, log.joints))
-    if config.log is not None:
-        require_poses(setting.model(config))
+    setting = _Setting(options, arm, log, _sought(options.joints, log.joints), seed)
+    if options.log is not None:
+        require_poses(setting.model())
     return setting
 
 
@@ -230,12 +234,13 @@ def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(joint for joint in joints if not patterns or any(fnmatchcase(joint, p) for p in patterns))
 
 
-def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, console: Console) -> None:
+def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
     """Plan without a log: with usual noise, and deflections of a usual size."""
-    candidates = _candidates(config, setting, console)
-    model, noise = setting.model(config, candidates), _USUAL_NOISE[setting.log.kind]
+    candidates = _candidates(setting, console)
+    model = setting.model(candidates)
+    noise = _USUAL_NOISE[setting.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
-    plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, config.plan)
+    plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, setting.options.plan)
     own = model.unknowns.slices["compliance"]
     half = 1.96 * np.sqrt(np.diag(np.linalg.inv(plan.information))[own]) * model.scale[own] / start[own]
     table = Table(title=f"{len(plan.theta)} proposed poses")
@@ -249,7 +254,7 @@ def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, cons
         "deflection under the largest gravity torque of each joint; half the deflection doubles it",
         highlight=False,
     )
-    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True, markup=False)
+    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True)
 
 
 def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:

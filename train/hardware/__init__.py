@@ -1,1 +1,0 @@
-"""Sessions with servos, real or emulated."""
