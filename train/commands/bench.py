@@ -41,7 +41,8 @@ class BenchCase(Model):
     scenario: Title = "nominal"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2, description="seed of the episode")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
+    """Seed of the episode."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""
 
@@ -57,9 +58,8 @@ class BenchConfig(Model):
     """The rollouts of `elastic bench`."""
 
     name: Title = "bench"
-    margin: float = quantity(
-        "1", 0.05, ge=0, le=100, description="relative amount by which a figure may exceed the accepted"
-    )
+    margin: float = quantity("1", 0.05, ge=0, le=100)
+    """Relative amount by which a figure may exceed the accepted."""
     _kind = model_validator(mode="before")(is_a("bench"))
     cases: list[BenchCase] = Field(min_length=1, max_length=MOST_ENTRIES)
 

@@ -64,10 +64,12 @@ class CompareConfig(Model):
         default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1, max_length=MOST_ENTRIES
     )
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="episodes per cell")
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    """Episodes per cell."""
     scenario_episodes: dict[str, int] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    """Seed of the first episode."""
     ranges: GivenRanges = {}
     """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}

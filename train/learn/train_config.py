@@ -54,16 +54,20 @@ class TrainConfig(Model):
     """Its keyword arguments, over the defaults."""
     anneal: bool = False
     """Whether the learning rate falls linearly to zero over the decisions."""
-    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
-    worlds: int = quantity("1", 64, ge=2, le=10_000_000, description="worlds, shared out to the scenarios")
-    decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS, description="decisions of all worlds together")
+    clip: float = quantity("1", 10.0, gt=0, le=1e6)
+    """Bound of normalised features, in standard deviations."""
+    worlds: int = quantity("1", 64, ge=2, le=10_000_000)
+    """Worlds, shared out to the scenarios."""
+    decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
+    """Decisions of all worlds together."""
     seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1, max_length=MOST_ENTRIES)
     """Training seeds, each a run of its own."""
-    evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS, description="decisions between evaluations")
-    evaluation_episodes: int = quantity(
-        "1", 4, ge=1, le=MOST_EPISODES, description="episodes per scenario in an evaluation"
-    )
-    checkpoint_every: int = quantity("1", 10_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
+    evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
+    """Decisions between evaluations."""
+    evaluation_episodes: int = quantity("1", 4, ge=1, le=MOST_EPISODES)
+    """Episodes per scenario in an evaluation."""
+    checkpoint_every: int = quantity("1", 10_000, ge=1, le=_MOST_DECISIONS)
+    """Decisions between checkpoints."""
 
     _kind = model_validator(mode="before")(is_a("training"))
     _checked = field_validator("base")(require_plain_base)

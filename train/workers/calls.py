@@ -286,6 +286,8 @@ def _outcome(future: Future[Any]) -> Outcome:
     error = future.exception()
     if error is None:
         return future.result()
+    if type(error).__name__ == "KilledWorker":  # of dask, which has moved the call itself
+        return Outcome(error=WorkerKilledError())
     return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
 
 

@@ -26,10 +26,14 @@ class SlurmConfig(Model):
     """Partition; None for Slurm's default."""
     account: Title | None = None
     """Account that is charged; None for Slurm's default."""
-    time_min: int = quantity("min", 60, ge=1, le=100_000, description="longest time of a job")
-    memory_gb: float = quantity("GB", 4.0, gt=0, le=10_000, description="memory of a job")
-    cores: int = quantity("1", 1, ge=1, le=1024, description="cores of a job")
-    at_once: int = quantity("1", 256, ge=1, le=100_000, description="jobs that run at the same time")
+    time_min: int = quantity("min", 60, ge=1, le=100_000)
+    """Longest time of a job [min]."""
+    memory_gb: float = quantity("GB", 4.0, gt=0, le=10_000)
+    """Memory of a job [GB]."""
+    cores: int = quantity("1", 1, ge=1, le=1024)
+    """Cores of a job."""
+    at_once: int = quantity("1", 256, ge=1, le=100_000)
+    """Jobs that run at the same time."""
 
     def parameters(self) -> dict[str, Any]:
         """As submitit calls them."""
