@@ -43,7 +43,7 @@ from train.learn.scores import played_together
 from train.learn.state import read_state, write_state
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Training
-from train.runs.folders import locked
+from train.runs.folders import lock_run
 from train.workers.executors import Executors
 
 ROOT = Path(__file__).parents[1]
@@ -627,7 +627,7 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
     (tmp_path / "run" / "seed_3").mkdir(parents=True)
     (tmp_path / "run" / "config.yaml").write_text(Path("c.yaml").read_text())
     with (
-        locked(tmp_path / "run" / "seed_3"),
+        lock_run(tmp_path / "run" / "seed_3"),
         pytest.raises(ConfigurationError, match=rf"process {os.getpid()} of .* works on .*run/seed_3"),
     ):
         resume([tmp_path / "run"], Console(quiet=True))

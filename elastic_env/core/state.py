@@ -26,7 +26,7 @@ class Stateful:
 
     def get_state(self) -> dict[str, Any]:
         """All that the next steps depend on, as nested dictionaries and lists of arrays and plain values."""
-        parts = {name: taken(getattr(self, name), f"{type(self).__name__}.{name}") for name in self.STATE}
+        parts = {name: dump_state(getattr(self, name), f"{type(self).__name__}.{name}") for name in self.STATE}
         return {_CLASS: type(self).__name__, _PARTS: parts}
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -45,10 +45,10 @@ class Stateful:
                 "resume it with that version (metadata.json tells the commit), or train anew"
             )
         for name in self.STATE:
-            setattr(self, name, given(getattr(self, name), parts[name]))
+            setattr(self, name, load_state(getattr(self, name), parts[name]))
 
 
-def taken(value: Any, owner: str) -> Any:
+def dump_state(value: Any, owner: str) -> Any:
     """The state of a value.
 
     Args:
@@ -67,11 +67,11 @@ def taken(value: Any, owner: str) -> Any:
     if isinstance(value, np.random.Generator):
         return {_GENERATOR: value.bit_generator.state}
     if isinstance(value, Rows):
-        return {name: taken(getattr(value, name), owner) for name in value._names()}
+        return {name: dump_state(getattr(value, name), owner) for name in value._names()}
     if isinstance(value, tuple | list):
-        return [taken(part, owner) for part in value]
+        return [dump_state(part, owner) for part in value]
     if isinstance(value, dict):
-        return {name: taken(part, owner) for name, part in value.items()}
+        return {name: dump_state(part, owner) for name, part in value.items()}
     get_state = getattr(value, "get_state", None)
     if get_state is not None:
         return get_state()
@@ -81,12 +81,12 @@ def taken(value: Any, owner: str) -> Any:
     )
 
 
-def given(value: Any, state: Any) -> Any:
+def load_state(value: Any, state: Any) -> Any:
     """The value to keep for a state: the same object brought into it, or a new one.
 
     Args:
         value: What is there, built alike.
-        state: What `taken` returned for its like.
+        state: What `dump_state` returned for its like.
     """
     if isinstance(value, np.random.Generator):
         value.bit_generator.state = state[_GENERATOR]
@@ -95,15 +95,15 @@ def given(value: Any, state: Any) -> Any:
         value.set_state(state)
         return value
     if isinstance(value, Rows):
-        return type(value)(*(given(getattr(value, name), part) for name, part in state.items()))
+        return type(value)(*(load_state(getattr(value, name), part) for name, part in state.items()))
     if isinstance(state, np.ndarray):
         # not in place: what was one array may have become two; a file does not keep the class of rows with fields
         return state.astype(value.dtype) if isinstance(value, np.ndarray) and state.dtype.names else state.copy()
     if isinstance(state, dict):
         known: Mapping[str, Any] = value if isinstance(value, dict) else {}
-        return {name: given(known.get(name), part) for name, part in state.items()}
+        return {name: load_state(known.get(name), part) for name, part in state.items()}
     if isinstance(state, list):
         old = value if isinstance(value, list | tuple) and len(value) == len(state) else [None] * len(state)
-        parts = [given(mine, part) for mine, part in zip(old, state, strict=True)]
+        parts = [load_state(mine, part) for mine, part in zip(old, state, strict=True)]
         return tuple(parts) if isinstance(value, tuple) else parts
     return state

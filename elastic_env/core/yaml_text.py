@@ -84,7 +84,7 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str) -> Any:
-    """What a text in YAML holds: mappings with text as keys, lists, text, numbers, truth values, and None.
+    """Content of a text in YAML: mappings with text as keys, lists, text, numbers, truth values, and None.
 
     Raises:
         yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as objects, zero bytes,

@@ -21,7 +21,7 @@ from train.evaluate.evaluate import (
     num_steps,
     plays_beside_others,
 )
-from train.runs.failures import DEFECT, explained
+from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
 from train.runs.warned import each_once, said_so_far
 from train.workers.calls import Outcome, Tally, Watch, run_calls
@@ -203,7 +203,7 @@ def _said(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     """What failed and the exit code; a defect's traceback goes to the terminal."""
     error = outcome.error
     assert error is not None
-    found = explained(error)
+    found = explain(error)
     said, code = found or (f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}", DEFECT)
     return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
 

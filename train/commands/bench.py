@@ -13,7 +13,6 @@ import yaml
 from pydantic import Field, model_validator
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
@@ -23,6 +22,7 @@ from train.cells.play import run_conditions
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import Evaluation
+from train.runs.console import make_table
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
@@ -172,13 +172,14 @@ def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> N
             if metric in episode and not episode["termination"]:
                 changes.append((figures[metric], f"{episode[metric]:.4g}"))
     for node, value in sorted(changes, key=lambda change: -change[0].start_mark.index):
-        begin, end = node.start_mark.index, node.end_mark.index
+        begin = node.start_mark.index
+        end = node.end_mark.index
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text)  # the user named it, maybe by a link
 
 
 def _figure_nodes(text: str) -> list[dict[str, yaml.Node]]:
-    """Where the figures of every case stand in a configuration, by metric."""
+    """Nodes of the figures of every case in a configuration, by metric."""
     cases = _child(yaml.compose(text), "cases")
     return [{key.value: value for key, value in _child(case, "figures").value} for case in cases.value]
 
@@ -207,15 +208,16 @@ _COLUMNS = ("rollout", "figure", "measured", "accepted", "at most", "")
 
 
 def _table(figures: list[Figure]) -> Table:
-    table = Table(title="short rollouts against what was accepted", box=box.SIMPLE)
-    for name in ("rollout and figure", "measured", "at most", ""):
-        table.add_column(name, justify="right" if name in ("measured", "at most") else "left")
+    rows = []
     last = ""
     for case, metric, measured, _, bound, verdict in _rows(figures):
         if case != last:
-            table.add_row(escape(case), "", "", "")
-        table.add_row(escape(f"  {metric}"), measured, bound, verdict)
+            rows.append((case, "", "", ""))
+        rows.append((f"  {metric}", measured, bound, verdict))
         last = case
+    head = ["rollout and figure", "measured", "at most", ""]
+    table = make_table("short rollouts against what was accepted", head, rows, box=box.SIMPLE)
+    table.columns[-1].justify = "left"
     return table
 
 

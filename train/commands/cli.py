@@ -22,7 +22,7 @@ from rich.text import Text
 import elastic_env
 from elastic_env.core.errors import shortened
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
-from train.runs.failures import DEFECT, EndedError, explained
+from train.runs.failures import DEFECT, EndedError, explain
 from train.runs.import_path import look_last_in
 from train.runs.progress import say_what_is_compiled
 
@@ -48,13 +48,13 @@ CONSOLE = PlainConsole()
 
 
 def _with_notes(error: BaseException, said: str | None = None) -> str:
-    """What an error says, and what was noted on its way here."""
+    """Text of an error, with the notes that it got on its way."""
     return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
 
 
-def _told(error: Exception) -> int:
+def _print_failure(error: Exception) -> int:
     """Say what failed; the exit code."""
-    found = explained(error)
+    found = explain(error)
     if found is None:
         sys.stderr.write(traceback_of(error))
     said, code = found or (f"this is a defect of elastic-env, please report it: {type(error).__name__}", DEFECT)
@@ -162,7 +162,7 @@ def main(arguments: list[str] | None = None) -> None:
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
         except Exception as error:
-            sys.exit(_told(error))
+            sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"

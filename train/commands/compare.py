@@ -31,7 +31,7 @@ from train.report.changes_tables import print_changes, write_maps, write_statist
 from train.report.leaderboard import print_leaderboard, write_leaderboard
 from train.report.robots_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
-from train.runs.folders import describe, locked, require_run, run_folder
+from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
 from train.runs.user_code import code_refused, require_no_code
 from train.runs.warned import each_once
@@ -48,7 +48,7 @@ class Sweep(Model):
     """Option of the policies, such as stiffness_scale."""
     values: list[float] = Field(min_length=2, max_length=MOST_ENTRIES)
     label: Title | None = None
-    """What the axis says; None for the option's name."""
+    """Label of the axis; None for the option's name."""
 
 
 class CompareConfig(Model):
@@ -85,7 +85,7 @@ class CompareConfig(Model):
     reference_scenarios: dict[str, list[Title]] = {}
     """Scenarios of single references, by their names in tables, where not all are played: {24 s: [nominal]}."""
     leaderboard: bool = False
-    """Whether a leaderboard is written: policies in tracks, groups and motions as columns, and the time of a step."""
+    """Write a leaderboard: policies in tracks, groups and motions as columns, and the time of a step."""
 
     @model_validator(mode="before")
     @classmethod
@@ -181,9 +181,16 @@ class CompareConfig(Model):
             )
         return [
             Condition(
-                env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
-                scenario=scenario, swept=swept, ranges=self.ranges,
-                env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
+                env=self.env,
+                policy=entrant.policy,
+                member=entrant.member,
+                reference=reference,
+                label=label,
+                scenario=scenario,
+                swept=swept,
+                ranges=self.ranges,
+                env_options=self.env_options,
+                episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
             for reference, label, scenarios in zip(
@@ -192,7 +199,7 @@ class CompareConfig(Model):
             for scenario in scenarios
             for entrant in entrants
             for swept in self._swept(entrant.policy)
-        ]  # fmt: skip
+        ]
 
     def _swept(self, policy: PolicySpec) -> list[dict[str, float]]:
         if self.map is not None:
@@ -202,7 +209,7 @@ class CompareConfig(Model):
         return [{self.sweep.option: value} for value in self.sweep.values]
 
     def _reference_names(self) -> list[str]:
-        """What tables call the references."""
+        """Names of the references in tables."""
         known = environment(self.env)
         labels = self._reference_labels()
         return [label or known.label(reference) for label, reference in zip(labels, self.references, strict=True)]
@@ -268,7 +275,7 @@ def compare(
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
     with _folder(config, output, work) as folder:
-        evaluations = _played(conditions, console, work, folder, keeps=report)
+        evaluations = _play_cells(conditions, console, work, folder, keeps=report)
         files = [write_episodes(evaluations, folder / "episodes.csv")]
         robots = robot_scores(evaluations)
         if robots:
@@ -299,7 +306,7 @@ def compare(
     return Comparison(folder, evaluations, files)
 
 
-def recorded(folder: Path, trust_code: bool = False) -> CompareConfig:
+def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
     """The configuration of a run that is gone on with.
 
     Args:
@@ -324,16 +331,16 @@ def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[
     """The folder of a run, new or gone on with, for this program alone."""
     content = config.model_dump(mode="json")
     if not work.resumes or output is None:
-        with run_folder(config.name, content, config.seed, output) as folder, locked(folder):
+        with run_folder(config.name, content, config.seed, output) as folder, lock_run(folder):
             yield folder
         return
     require_run(output, "run", "compare wrote")
-    with locked(output):
+    with lock_run(output):
         describe(output, content, config.seed)
         yield output
 
 
-def _played(
+def _play_cells(
     conditions: Sequence[Condition], console: Console, work: Work, folder: Path, keeps: bool
 ) -> list[Evaluation]:
     """The cells; what is finished when some fail, or at Ctrl-C, is kept."""
@@ -428,7 +435,7 @@ class Compare(Model):
     jobs: int = 0
     """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
     on: str = "local"
-    """Where they run: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
     resume: Path | None = None
     """Folder of a run to go on with: what is missing or has changed is played."""
     fresh: bool = False
@@ -443,7 +450,7 @@ class Compare(Model):
         if self.config is not None:
             config = load_yaml(self.config, CompareConfig)
         else:
-            config = recorded(cast(Path, self.resume), self.trust_code)
+            config = recorded_config(cast(Path, self.resume), self.trust_code)
         if self.hardware.arguments:
             real = self.hardware.environment(config.env)
             real["env_options"] = {**config.env_options, **real["env_options"]}

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 import baselines.identification.identify as identification
@@ -19,6 +18,7 @@ from train.figures import plots
 from train.figures.figures import cells, draw_figure
 from train.figures.testbed_plots import draw_identification, draw_static_errors, draw_time_series, static_errors
 from train.report.summary import print_summary, write_episodes, write_summary
+from train.runs.console import make_table
 from train.runs.folders import run_folder
 
 PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
@@ -110,42 +110,40 @@ class Demo(Model):
             console.print(f"  {path}", soft_wrap=True)
 
 
+_HEAD = ("quantity", "here", "paper")
+
+
 def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:
-    table = _beside_the_paper("the paper's testbed experiments, Figs. 5 and 6")
-    table.add_row("true stiffness of the plant [N·m/rad]", "1001", "-")
-    low, high = result.stiffness_low_nm_per_rad, result.stiffness_high_nm_per_rad
-    table.add_row("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001")
-    table.add_row("  95 % interval", f"{low:.1f} to {high:.1f}", "-")
-    table.add_row("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001")
-    table.add_row("friction [N·m]", f"{result.friction_nm:.2f}", "-")
-    table.add_row("Pearson r", f"{result.pearson_r:.4f}", "0.9775")
+    low = result.stiffness_low_nm_per_rad
+    high = result.stiffness_high_nm_per_rad
+    rows = [
+        ("true stiffness of the plant [N·m/rad]", "1001", "-"),
+        ("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001"),
+        ("  95 % interval", f"{low:.1f} to {high:.1f}", "-"),
+        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
+        ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
+        ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
+    ]
     for evaluation, paper in zip(static, ("-56.2 to +41.7", "-3.7 to +7.1"), strict=True):
         error = 1e3 * static_errors(evaluation)
-        name = evaluation.condition.policy.title
-        table.add_row(escape(f"link error at rest, {name} [mrad]"), f"{error.min():+.1f} to {error.max():+.1f}", paper)
-    return table
+        name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
+        rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
+    return make_table("the paper's testbed experiments, Figs. 5 and 6", _HEAD, rows)
 
 
 def _walk_table(walks: Sequence[Evaluation]) -> Table:
-    table = _beside_the_paper("the paper's walks, Figs. 7 and 8: largest roll and pitch")
+    rows = []
     for walk in walks:
         condition = walk.condition
         is_paper = condition.scenario == "nominal"
-        where = condition.environment.title(condition.reference_name) + ("" if is_paper else f", {condition.scenario}")
-        name = f"{where}, {condition.policy.title} [mrad]"
+        scenario = "" if is_paper else f", {condition.scenario}"
+        walked = condition.environment.title(condition.reference_name) + scenario
         paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
-        table.add_row(escape(name), "fell" if walk.num_failed else _pelvis_peaks(walk), paper)
-    return table
+        name = f"{walked}, {condition.policy.title} [mrad]"
+        rows.append((name, "fell" if walk.num_failed else _pelvis_peaks(walk), paper))
+    return make_table("the paper's walks, Figs. 7 and 8: largest roll and pitch", _HEAD, rows)
 
 
 def _pelvis_peaks(walk: Evaluation) -> str:
     roll, pitch = (1e3 * np.max(walk.values(f"pelvis_{axis}_peak_rad")) for axis in ("roll", "pitch"))
     return f"{roll:.1f} and {pitch:.1f}"
-
-
-def _beside_the_paper(title: str) -> Table:
-    table = Table(title=title)
-    table.add_column("quantity")
-    table.add_column("here", justify="right")
-    table.add_column("paper", justify="right")
-    return table

@@ -137,7 +137,7 @@ class Run(Model):
             configuration = {"policy": spec.model_dump(mode="json"), "reference": reference, **arguments}
             with run_folder("hardware", configuration, None, self.output) as folder:
                 metrics: dict[str, Any] = {}
-                with _kept(folder / "log.csv", console) as log:
+                with _open_log(folder / "log.csv", console) as log:
                     for info in _episode(env, policy):
                         log.take(info)
                         metrics = info.get("episode_metrics", metrics)
@@ -146,9 +146,11 @@ class Run(Model):
 
 
 def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
-    """What every step of an episode tells."""
+    """Play an episode; yields the info of every step."""
     observation, _ = env.reset()
-    state, start, truncated = None, np.array(True), False
+    state = None
+    start = np.array(True)
+    truncated = False
     while not truncated:
         action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
         observation, _, _, truncated, info = env.step(action)
@@ -172,7 +174,8 @@ class _Log:
 
     def __init__(self, file: TextIO, console: Console) -> None:
         self.num_rows = 0
-        self._file, self._console = file, console
+        self._file = file
+        self._console = console
         self._writer: csv.DictWriter[str] | None = None
         self._next_s = _SHOWN_S
 
@@ -195,7 +198,7 @@ class _Log:
 
 
 @contextlib.contextmanager
-def _kept(path: Path, console: Console) -> Iterator[_Log]:
+def _open_log(path: Path, console: Console) -> Iterator[_Log]:
     """A log that stays whatever ends the episode."""
     with path.open("w", newline="") as file:
         log = _Log(file, console)
@@ -238,7 +241,7 @@ class Emulate(Model):
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
     fault: list[str] = []
-    """What breaks after a while: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf, imu_out_of_range,
+    """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf, imu_out_of_range,
     imu_frozen."""
     fault_after_s: float = 20.0
     """When that happens, after the start [s]."""

@@ -22,6 +22,7 @@ from train.commands.identify_arm import ArmOptions, run_arm_identification
 from train.commands.options import OnHardware, option_name
 from train.figures import plots
 from train.figures.testbed_plots import draw_identification
+from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress, show_progress
@@ -130,7 +131,7 @@ class Identify(Model):
 
 @contextmanager
 def _progress(hardware: dict[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
-    """What takes the share of the work that is done."""
+    """A function that takes the share of the work that is done."""
     work = "visiting static positions"
     if hardware:
         console.print(f"{work} at {hardware['port']}", soft_wrap=True)
@@ -142,7 +143,8 @@ def _progress(hardware: dict[str, Any], console: Console) -> Iterator[Callable[[
 
 def result_table(result: Identification) -> Table:
     """An identification as a table."""
-    low, high = result.stiffness_low_nm_per_rad, result.stiffness_high_nm_per_rad
+    low = result.stiffness_low_nm_per_rad
+    high = result.stiffness_high_nm_per_rad
     rows = [
         ("stiffness K", f"{result.stiffness_nm_per_rad:.1f} N·m/rad"),
         ("  95 % interval", f"{low:.1f} to {high:.1f} (± {100 * result.half_width:.2f} %)"),
@@ -156,10 +158,7 @@ def result_table(result: Identification) -> Table:
     ]
     if result.imu_sine_error_rad is not None:
         rows.insert(6, ("IMU error ~ sin q", f"{1e3 * result.imu_sine_error_rad:+.2f} mrad"))
-    table = Table(title="identification", show_header=False)
-    for name, value in rows:
-        table.add_row(name, value)
-    return table
+    return make_table("identification", ["", ""], rows, left=2, show_header=False)
 
 
 def identified_environments(options: Identify) -> list[Any]:

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from baselines.identification.arm_fit import USUAL_EVALUATIONS, ArmFit, fit_arm, in_unit, require_poses, summed_up
@@ -30,6 +29,7 @@ from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.model_file import compiled_model
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
+from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
@@ -133,22 +133,28 @@ def run_arm_identification(
 
 def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
-    has_friction, has_plan = not result.friction_is_noise, result.joints[0].planned_half_width is not None
+    has_friction = not result.friction_is_noise
+    has_plan = result.joints[0].planned_half_width is not None
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
-    table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0))
-    table.add_column("joint", no_wrap=True)
-    heads = ["K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction]
-    for head in [*heads, "o [mrad]"]:
-        table.add_column(escape(head), justify="right", no_wrap=True)
-    for joint in result.joints:
-        cells = [*_stiffness_cells(joint), *[_percent(joint.planned_half_width)] * has_plan]
-        cells += [_number(joint.friction_nm)] * has_friction + [_number(1e3 * joint.offset_rad)]
-        table.add_row(escape(joint.joint), *cells)
+    head = ["joint", "K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction, "o [mrad]"]
+    rows = [
+        [
+            joint.joint,
+            *_stiffness_cells(joint),
+            *[_percent(joint.planned_half_width)] * has_plan,
+            *[_number(joint.friction_nm)] * has_friction,
+            _number(1e3 * joint.offset_rad),
+        ]
+        for joint in result.joints
+    ]
+    table = make_table(title, head, rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for column in table.columns:
+        column.no_wrap = True
     return table
 
 
 def remarks(result: ArmIdentification, fit: ArmFit) -> list[str]:
-    """What the table does not say: the payload, joints that are not told apart, and poses that do not fit."""
+    """Remarks beside the table: the payload, joints that are not told apart, and poses that do not fit."""
     lines = []
     if result.payload_kg is not None and result.payload_half_width_kg is not None:
         lines.append(f"payload {result.payload_kg:.3f} ± {result.payload_half_width_kg:.3f} kg")
@@ -215,7 +221,7 @@ def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed:
         log = empty_log(arm, options.measured_by or "end_effector")
     if options.end_effector is None and log.kind in ("end_effector", "imu"):
         console.print(f"measured is taken to be {arm.end_effector!r}; --end-effector names another site or body")
-    setting = _Setting(options, arm, log, _sought(options.joints, log.joints), seed)
+    setting = _Setting(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
     if options.log is not None:
         require_poses(setting.model())
     return setting
@@ -226,7 +232,7 @@ def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     """Joints that a name or pattern fits, in the order of the log."""
     for pattern in patterns:
         if not any(fnmatchcase(joint, pattern) for joint in joints):
@@ -243,12 +249,8 @@ def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
     plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, setting.options.plan)
     own = model.unknowns.slices["compliance"]
     half = 1.96 * np.sqrt(np.diag(np.linalg.inv(plan.information))[own]) * model.scale[own] / start[own]
-    table = Table(title=f"{len(plan.theta)} proposed poses")
-    table.add_column("joint")
-    table.add_column("expected ± of K", justify="right")
-    for joint, width in zip(setting.elastic, half, strict=True):
-        table.add_row(escape(joint), _percent(float(width)))
-    console.print(table)
+    rows = [(joint, _percent(float(width))) for joint, width in zip(setting.elastic, half, strict=True)]
+    console.print(make_table(f"{len(plan.theta)} proposed poses", ["joint", "expected ± of K"], rows))
     console.print(
         f"expected for noise of {in_unit(noise, setting.log.kind)} and {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad of "
         "deflection under the largest gravity torque of each joint; half the deflection doubles it",
@@ -265,7 +267,8 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
 
 
 def _stiffness_cells(joint: JointStiffness) -> list[str]:
-    low, high = joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad
+    low = joint.stiffness_low_nm_per_rad
+    high = joint.stiffness_high_nm_per_rad
     if joint.source == "assumed" or low is None or high is None:
         return ["-", "-", _percent(joint.half_width)]
     return [f"{joint.stiffness_nm_per_rad:.4g}", f"{low:.4g} to {high:.4g}", _percent(joint.half_width)]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from pydantic import model_validator
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from baselines.adaptation.iterative import IterativeLearner, Stage, Trial
@@ -25,6 +24,7 @@ from train.evaluate.environments import Column
 from train.evaluate.evaluate import make_policy, make_vector_env
 from train.figures import plots
 from train.figures.learning_plots import draw_trials
+from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import provenance, run_folder
 from train.runs.progress import show_progress
@@ -136,15 +136,13 @@ def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Conso
 
 def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
     """The judged metrics and the failures of every trial, the mean over the robots that did not fail."""
-    table = Table(title=f"{condition.environment.title(condition.reference_name)}, {condition.scenario}")
-    table.add_column("trial", justify="right")
-    for column in columns:
-        table.add_column(escape(column.label), justify="right")
-    table.add_column(condition.environment.failures, justify="right")
+    title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
+    head = ["trial", *(column.label for column in columns), condition.environment.failures]
+    rows = []
     for trial in trials:
         values = [f"{column.scale * trial_mean(trial, column.metric):.{column.decimals}f}" for column in columns]
-        table.add_row(str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}")
-    return table
+        rows.append([str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}"])
+    return make_table(title, head, rows, left=0)
 
 
 def trial_mean(trial: Trial, metric: str) -> float:

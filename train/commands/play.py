@@ -37,7 +37,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     """
     env: Any = gymnasium.make(
         condition.environment.id, render_mode="human" if video is None else "rgb_array", **condition.arguments
-    )  # fmt: skip
+    )
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):
@@ -89,7 +89,8 @@ def episode(
         console: Where messages go.
     """
     observation, _ = env.reset(seed=condition.seed)
-    state, start = None, np.array(True)
+    state = None
+    start = np.array(True)
     for step in range(steps):
         with blamed(condition, step):
             action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
@@ -121,7 +122,9 @@ def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Pa
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     video.parent.mkdir(parents=True, exist_ok=True)
     writer: Any
-    frame_s, frames, gif = every * period, 0, io.BytesIO()
+    frame_s = every * period
+    frames = 0
+    gif = io.BytesIO()
     is_gif = video.suffix == ".gif"
     timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
     # a GIF is made in memory in any case, and its writer would print what a full disk makes it raise

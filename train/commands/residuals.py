@@ -77,7 +77,8 @@ def reproduce(
         executors: Where training seeds and cells run, and how many at a time.
         configs: Folder of both configurations.
     """
-    training, comparison = folder / name / "training", folder / name / "comparison"
+    training = folder / name / "training"
+    comparison = folder / name / "comparison"
     config = load_yaml(configs / f"train_{name}.yaml", TrainConfig).replace(seeds=list(seeds))
     if (training / CONFIG).is_file():
         resume([training], console, executors)

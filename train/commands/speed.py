@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 from rich.console import Console
@@ -18,6 +18,7 @@ from rich.table import Table
 
 from elastic_env.core.config import Model, quantity
 from train.evaluate.environments import environment
+from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
@@ -150,7 +151,7 @@ def measure(config: Speed, progress: Callable[[float], None] | None = None) -> l
 
 
 def _entries(config: Speed) -> list[_Entry]:
-    """What is timed, every reference before or right after what is compared with it."""
+    """Everything that is timed, every reference before or right after what is compared with it."""
     threads = config.threads_used
     env = config.env
     policy = config.looped_policy
@@ -163,7 +164,8 @@ def _entries(config: Speed) -> list[_Entry]:
         entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy), raw))
         entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy, residual=True), raw))
     if config.others:
-        scalar, raw = ScalarLoop(env), len(entries) + 1
+        scalar = ScalarLoop(env)
+        raw = len(entries) + 1
         entries += [_Entry(scalar, raw), _Entry(RawWorlds(scalar, 1), raw)]
         for count in config.processes:
             entries.append(_Entry(GymnasiumLoop(env, "async", count), 0))
@@ -178,8 +180,10 @@ def _entries(config: Speed) -> list[_Entry]:
 
 
 def _result(config: Speed, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:
-    entry, reference = entries[number], entries[entries[number].against]
-    mine, others = rates[number][1:], rates[entry.against][1:]
+    entry = entries[number]
+    reference = entries[entries[number].against]
+    mine = rates[number][1:]
+    others = rates[entry.against][1:]
     return SpeedResult(
         env=config.env,
         contender=entry.contender.title,
@@ -192,7 +196,7 @@ def _result(config: Speed, entries: Sequence[_Entry], rates: list[list[float]], 
 
 
 def profile(config: Speed) -> str:
-    """Where the time of the vector environment with its policy goes, as text."""
+    """Profile of the vector environment with its policy, as text."""
     n = config.num_envs[0]
     loop = VectorLoop(config.env, n, min(config.threads_used, n), config.looped_policy)
     loop.run(config.steps)
@@ -239,10 +243,8 @@ def measure_all(config: Speed, console: Console) -> Path:
 
 
 def _table(config: Speed, results: Sequence[SpeedResult]) -> Table:
-    table = Table(title=f"{config.env}: control steps per second, medians of one interleaved run")
-    for name, justify in (("", "left"), ("worlds", "right"), ("steps/s", "right"), ("ratio", "right"), ("to", "left")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for r in results:
-        row: tuple[Any, ...] = (r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against)
-        table.add_row(*row)
+    title = f"{config.env}: control steps per second, medians of one interleaved run"
+    rows = [(r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against) for r in results]
+    table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
+    table.columns[-1].justify = "left"
     return table

@@ -38,7 +38,7 @@ class Train(Model):
     jobs: int = 1
     """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
     on: str = "local"
-    """Where seeds run: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
 
     def run(self, console: Console) -> None:
         """Train, or go on with it."""

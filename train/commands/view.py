@@ -27,7 +27,8 @@ from train.commands.view_proxy import LOOPBACK, Access, Proxy, listen
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import make_policy
 
-FIRST_FACTOR, LARGEST_FACTOR = 3.0, 20.0
+FIRST_FACTOR = 3.0
+LARGEST_FACTOR = 20.0
 """Factors of the slider: the one at the start, and its end."""
 
 _FRAMES_PER_S = 50
@@ -35,7 +36,8 @@ _PAUSE_S = 0.01
 _SHORT = "/tmp"
 """Where a socket is: its path may have about a hundred characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
-_PLACE, _SIZE = (16.0, 40.0), (400.0, 130.0)
+_PLACE = (16.0, 40.0)
+_SIZE = (400.0, 130.0)
 """Of the window of sliders [pixels]."""
 
 
@@ -60,7 +62,7 @@ class Recording:
 
 @dataclass
 class Playback:
-    """What the sliders of the page set and the drawing reads: time [s], factor, and whether time stands still."""
+    """State of the page, which sliders set and the drawing reads: time [s], factor, and whether time stands still."""
 
     recording: Recording
     time_s: float = 0.0
@@ -70,7 +72,8 @@ class Playback:
 
     def tick(self) -> None:
         """Go on by the time that has passed, from the end back to the start."""
-        now, last = time.monotonic(), self._last_s
+        now = time.monotonic()
+        last = self._last_s
         self._last_s = now
         if not self.paused:
             end = self.recording.times_s[-1]
@@ -92,7 +95,8 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
-    times_s, frames = [], []
+    times_s = []
+    frames = []
     with contextlib.closing(env):
         steps = steps_within(task, max_s)
         picture = env.unwrapped.picture
@@ -111,7 +115,8 @@ class _Poses(plugin.SimPlugin):
     """Takes the place of the physics: poses the three robots."""
 
     def __init__(self, playback: Playback, scene: SideBySide) -> None:
-        self._playback, self._scene = playback, scene
+        self._playback = playback
+        self._scene = scene
 
     @messages.handler
     def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
@@ -215,7 +220,8 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
 
 def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
     """Start the viewer in a thread; it listens on a Unix socket of a path."""
-    scene, playback = SideBySide(recording.robot), Playback(recording)
+    scene = SideBySide(recording.robot)
+    playback = Playback(recording)
     plugins = [
         app.App(app.Config(show_options=False, show_inspector=False)),
         _Poses(playback, scene),

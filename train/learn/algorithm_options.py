@@ -27,7 +27,8 @@ _OURS = {
 """Arguments of the algorithms that are no options, and what stands in their place."""
 
 _LARGEST_WEIGHT = 1e3
-_WIDEST, _MOST_LAYERS = 4096, 16
+_WIDEST = 4096
+_MOST_LAYERS = 16
 
 
 def _network(*parts: str) -> Any:

@@ -16,7 +16,8 @@ from train.evaluate.progress import read_progress
 from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig
 from train.learn.trainer import Trainer
-from train.runs.folders import locked, locked_part, require_name, require_run, run_folder
+from train.runs.console import make_table
+from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
 from train.runs.user_code import code_refused, require_no_code
 from train.workers.calls import Outcome, Tally, Watch, run_calls
@@ -65,7 +66,7 @@ def start(
             own = output if output is None or len(configs) == 1 else output / require_name(config.name)
             made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
             runs.append(Run(config, held.enter_context(made)))
-            held.enter_context(locked(runs[-1].folder))
+            held.enter_context(lock_run(runs[-1].folder))
         _train(runs, console, executors)
     return [run.folder for run in runs]
 
@@ -84,15 +85,15 @@ def resume(
     Raises:
         ConfigurationError: A folder is no training run, another program works on it, or its algorithm is not trusted.
     """
-    runs = [Run(_recorded(folder, trust_code), folder) for folder in folders]
+    runs = [Run(_recorded_config(folder, trust_code), folder) for folder in folders]
     with ExitStack() as held:
         for run in runs:
-            held.enter_context(locked(run.folder))
+            held.enter_context(lock_run(run.folder))
         _train(runs, console, executors)
     return [run.folder for run in runs]
 
 
-def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
+def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
     """The configuration of a run that is gone on with."""
     file = require_run(folder, "training run", "train printed")
     if trust_code:
@@ -132,7 +133,7 @@ class _Call:
 
     @property
     def name(self) -> str:
-        """What progress calls it."""
+        """Name of the seed in the progress."""
         return f"{self.run.folder.name}, seed {self.seed}" if self.is_one_of_several else f"seed {self.seed}"
 
 
@@ -141,7 +142,8 @@ def _train_beside(calls: Sequence[_Call], console: Console, executors: Executors
 
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
     """
-    done, note = [0] * len(calls), ""
+    done = [0] * len(calls)
+    note = ""
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
@@ -177,7 +179,7 @@ def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, repo
     """
     own = folder / f"seed_{seed}"
     report(0)
-    with locked_part(own, _PATIENCE_S):
+    with lock_part(own, _PATIENCE_S):
         if not _is_complete(own):
             training = _trainer(config)(config, seed, own, threads)
             report(training.done)
@@ -186,7 +188,7 @@ def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, repo
 
 
 def _is_complete(own: Path) -> bool:
-    """Whether a seed's training has come to its end."""
+    """True if a seed's training has come to its end."""
     return (own / "last").is_dir()
 
 
@@ -203,15 +205,14 @@ def _trainer(config: TrainConfig) -> type[Trainer]:
 def _table(config: TrainConfig, folder: Path) -> Table:
     """Scores of the last policies against their base, on the episodes of the evaluation on the way."""
     columns = environment(config.env).judged
-    table = Table(title=f"last policies on {config.base}, on episodes that training never sees")
-    for name in ("seed", "scenario", *(column.label for column in columns), "failed"):
-        table.add_column(name, justify="left" if name == "scenario" else "right")
+    head = ["seed", "scenario", *(column.label for column in columns), "failed"]
+    table = []
     for seed in config.seeds:
         rows = read_progress(folder / f"seed_{seed}", [column.metric for column in columns], ["failed"])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
             scores = [_change(row[f"base_{column.metric}"], row[column.metric], column.scale) for column in columns]
-            table.add_row(str(seed), row["scenario"], *scores, f"{row['failed']:.0f}")
-    return table
+            table.append([str(seed), row["scenario"], *scores, f"{row['failed']:.0f}"])
+    return make_table(f"last policies on {config.base}, on episodes that training never sees", head, table, left=2)
 
 
 def _change(base: float, mine: float, scale: float) -> str:

@@ -37,7 +37,9 @@ class Scores:
     """
 
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
-        self._config, self._folder, self._threads = config, folder, threads
+        self._config = config
+        self._folder = folder
+        self._threads = threads
         self._provenance = provenance(seed)
         self._base_scores: list[_Scored] | None = None
         self.best = np.inf
@@ -56,9 +58,10 @@ class Scores:
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
         if self._base_scores is None:
-            self._base_scores = self._played(self._config.base, columns)
-        scores = self._base_scores if decisions == 0 else self._played(f"residual:{current}", columns)
-        table, ratios = [], []
+            self._base_scores = self._play(self._config.base, columns)
+        scores = self._base_scores if decisions == 0 else self._play(f"residual:{current}", columns)
+        table = []
+        ratios = []
         for scenario, (mine, falls), (base, base_falls) in zip(
             self._config.scenarios, scores, self._base_scores, strict=True
         ):
@@ -98,7 +101,7 @@ class Scores:
             return
         write_whole(path, "".join([lines[0], *kept]))
 
-    def _played(self, policy: str, metrics: list[str]) -> list[_Scored]:
+    def _play(self, policy: str, metrics: list[str]) -> list[_Scored]:
         """For each scenario means of metrics over the episodes that did not fail, and how many did."""
         conditions = [self._config.condition(scenario, policy) for scenario in self._config.scenarios]
         results = played_together(conditions, metrics, self._threads)
@@ -155,9 +158,12 @@ def played_together(
     with closing(mixed_env(conditions, sizes, num_threads)) as worlds:
         policy = make_policy(conditions[0].policy, worlds)
         seeds = [condition.seed + episode for condition in conditions for episode in range(condition.episodes)]
-        values, failed = np.full((len(seeds), len(metrics)), np.nan), np.zeros(len(seeds), dtype=np.bool_)
+        values = np.full((len(seeds), len(metrics)), np.nan)
+        failed = np.zeros(len(seeds), dtype=np.bool_)
         observation, _ = worlds.reset(seed=seeds)
-        state, starting, playing = None, np.ones_like(failed), np.ones_like(failed)
+        state = None
+        starting = np.ones_like(failed)
+        playing = np.ones_like(failed)
         while playing.any():
             action, state = policy.predict(observation, state=state, episode_start=starting, deterministic=True)
             observation, _, terminated, truncated, info = worlds.step(action)
@@ -165,7 +171,8 @@ def played_together(
             if starting.any():
                 scores = np.stack([info["episode_metrics"][name] for name in metrics], axis=1)
                 first = playing & starting
-                values[first], failed[first] = scores[first], terminated[first]
+                values[first] = scores[first]
+                failed[first] = terminated[first]
                 playing &= ~starting
                 observation, _ = worlds.reset(options={"reset_mask": starting})
     parts = np.cumsum(sizes)[:-1]

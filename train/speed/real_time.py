@@ -17,6 +17,7 @@ from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, pre
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.evaluate import blamed, make_policy
+from train.runs.console import make_table
 from train.runs.folders import run_folder
 
 _PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
@@ -24,7 +25,7 @@ _PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
 
 @dataclass(frozen=True)
 class RealTimeResult:
-    """What a policy kept of its time.
+    """Latencies of a policy against the clock.
 
     The latency of a cycle is the time from the moment at which it is due to the moment at which its command is ready.
     So it has the delay with which the system wakes the program. The time in the policy is without that.
@@ -89,10 +90,10 @@ def play_against_the_clock(env_name: str, policy_name: str | None, seconds: floa
         period_s = env.unwrapped.assumed_model.control_period_s  # type: ignore[attr-defined]
         cycles = max(round(seconds / period_s), 1)
         with blamed(condition):
-            observations = _recorded(env, policy, cycles)
+            observations = _record(env, policy, cycles)
             is_real_time = prefer_realtime(Priority.LOOP)
             try:
-                latency_s, policy_s = _timed(policy, observations, cycles, period_s)
+                latency_s, policy_s = _time(policy, observations, cycles, period_s)
             finally:
                 give_up_realtime()
     finally:
@@ -100,32 +101,40 @@ def play_against_the_clock(env_name: str, policy_name: str | None, seconds: floa
     return summary(env_name, name, period_s, latency_s, policy_s, is_real_time=is_real_time)
 
 
-def _recorded(env: Any, policy: Any, most: int) -> list[Any]:
+def _record(env: Any, policy: Any, most: int) -> list[Any]:
     """Observations of an episode with the policy in its loop, at most so many."""
     observation, _ = env.reset(seed=0)
-    found, state, start, is_over = [observation], None, np.array(True), False
+    found = [observation]
+    state = None
+    start = np.array(True)
+    is_over = False
     while not is_over and len(found) < most:
         action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
         observation, _, terminated, truncated, _ = env.step(action)
-        start, is_over = np.array(False), terminated or truncated
+        start = np.array(False)
+        is_over = terminated or truncated
         found.append(observation)
     return found
 
 
-def _timed(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:
+def _time(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:
     """Latency and time in the policy, (cycles,) [s]; a cycle that begins late is not left out."""
-    latency_s, policy_s = np.empty(cycles), np.empty(cycles)
+    latency_s = np.empty(cycles)
+    policy_s = np.empty(cycles)
     state: Any = None
     begin = time.perf_counter() + period_s
     for number, (index, observation) in enumerate(islice(cycle(enumerate(observations)), cycles)):
-        due, memory, start = begin + number * period_s, state if index else None, np.array(index == 0)
+        due = begin + number * period_s
+        memory = state if index else None
+        start = np.array(index == 0)
         remaining = due - time.perf_counter()
         if remaining > 0.0:
             time.sleep(remaining)
         called = time.perf_counter()
         _, state = policy.predict(observation, state=memory, episode_start=start, deterministic=True)
         ready = time.perf_counter()
-        latency_s[number], policy_s[number] = ready - due, ready - called
+        latency_s[number] = ready - due
+        policy_s[number] = ready - called
     return latency_s, policy_s
 
 
@@ -149,9 +158,15 @@ def summary(
         for name, percentile in (*_PERCENTILES.items(), ("max", 100.0))
     }
     return RealTimeResult(
-        env=env, policy=policy, is_real_time=is_real_time, period_us=1e6 * period_s, cycles=len(latency_s),
-        late=late, late_share=late / len(latency_s), **figures,
-    )  # fmt: skip
+        env=env,
+        policy=policy,
+        is_real_time=is_real_time,
+        period_us=1e6 * period_s,
+        cycles=len(latency_s),
+        late=late,
+        late_share=late / len(latency_s),
+        **figures,
+    )
 
 
 def measure_real_time(
@@ -187,10 +202,10 @@ def measure_real_time(
 
 
 def _table(result: RealTimeResult) -> Table:
-    table = Table(title=f"{result.policy} on the {result.env}, once in {result.period_us:.0f} µs; times in µs")
-    for name in ("", "median", "99 %", "99.9 %", "longest"):
-        table.add_column(name, justify="right" if name else "left")
+    title = f"{result.policy} on the {result.env}, once in {result.period_us:.0f} µs; times in µs"
     figures = asdict(result)
-    for title, key in (("from due to command", "latency"), ("in the policy", "policy")):
-        table.add_row(title, *(f"{figures[f'{key}_{name}_us']:.0f}" for name in (*_PERCENTILES, "max")))
-    return table
+    rows = [
+        (what, *(f"{figures[f'{key}_{name}_us']:.0f}" for name in (*_PERCENTILES, "max")))
+        for what, key in (("from due to command", "latency"), ("in the policy", "policy"))
+    ]
+    return make_table(title, ["", "median", "99 %", "99.9 %", "longest"], rows)

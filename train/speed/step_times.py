@@ -10,7 +10,8 @@ import numpy as np
 from train.evaluate.conditions import Condition
 from train.evaluate.evaluate import make_policy, make_vector_env
 
-_STEPS, _ROUNDS = 50, 15
+_STEPS = 50
+_ROUNDS = 15
 """Control steps per round: whole decisions of residuals, which take 25; rounds, of which the median counts."""
 
 
@@ -51,7 +52,8 @@ class _Player:
         self._policy = make_policy(condition.policy, self._env, condition.policy_options)
         self._observation, _ = self._env.reset(seed=condition.seed)
         self._state: Any = None
-        self._start, self._done = np.ones(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
+        self._start = np.ones(1, dtype=np.bool_)
+        self._done = np.zeros(1, dtype=np.bool_)
 
     def play(self, steps: int) -> float:
         """Play control steps; the time that the policy alone took [s]."""
@@ -63,7 +65,9 @@ class _Player:
             )
             spent_s += time.process_time() - begin
             self._observation, _, terminated, truncated, _ = self._env.step(action)
-            self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
+            # a world that ends begins a step later
+            self._start = self._done
+            self._done = terminated | truncated
         return spent_s
 
     def close(self) -> None:

@@ -44,7 +44,7 @@ class Executors:
 
     @property
     def is_local(self) -> bool:
-        """Whether they are processes of this machine."""
+        """True if they are processes of this machine."""
         return self.on == _LOCAL
 
     def threads_per_call(self, calls: int) -> int:

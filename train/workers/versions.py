@@ -1,4 +1,4 @@
-"""What results depend on besides their configuration: our sources, and the libraries that calculate."""
+"""Versions that results depend on: our sources, and the libraries that calculate."""
 
 import functools
 import hashlib
@@ -23,13 +23,13 @@ class VersionsDifferError(ConfigurationError):
 @functools.cache
 def physics() -> dict[str, str]:
     """Versions that the figures of a cell depend on, by name."""
-    return {"sources of the physics": _digest(_PHYSICS), **_installed()}
+    return {"sources of the physics": _digest(_PHYSICS), **_library_versions()}
 
 
 @functools.cache
 def everything() -> dict[str, str]:
     """Versions that all machines of a run must have in common, by name."""
-    return {"sources of elastic-env": _digest(_ALL), **_installed()}
+    return {"sources of elastic-env": _digest(_ALL), **_library_versions()}
 
 
 def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str) -> None:
@@ -47,7 +47,7 @@ def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str)
         )
 
 
-def _installed() -> dict[str, str]:
+def _library_versions() -> dict[str, str]:
     """Python and the libraries that calculate."""
     return {"python": platform.python_version(), **{name: _version(name) for name in _LIBRARIES}}
 
