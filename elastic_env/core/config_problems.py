@@ -188,6 +188,8 @@ def _meaning(model: type[BaseModel], path: ParameterPath) -> str:
         return ""
     unit = f" [{field.json_schema_extra['unit']}]"
     sentence = re.split(r"[.;] |\.$", " ".join(field.description.split()), maxsplit=1)[0]
+    if sentence[1:2].islower():  # no symbol and no abbreviation
+        sentence = sentence[0].lower() + sentence[1:]
     return f" ({sentence.removesuffix(unit)})"
 
 
