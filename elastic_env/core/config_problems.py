@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from elastic_env.core.errors import ConfigurationError, choices_listed, readable, shown
 
@@ -125,7 +126,10 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
         requirement = kind.format(entries="entry" if 1 in context.values() else "entries", **context)
     else:
         requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
-    return Problem(path, "must", f"must {requirement}{_unit(model, path)}, got {given}{_meaning(model, path)}")
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    meaning = meaning_of(field) if field is not None else ""
+    in_brackets = f" ({meaning})" if meaning else ""
+    return Problem(path, "must", f"must {requirement}{_unit(model, path)}, got {given}{in_brackets}")
 
 
 _REQUIREMENTS = {
@@ -181,16 +185,14 @@ def _number(bound: float) -> str:
     return f"{bound:d}" if isinstance(bound, int) else f"{bound:.6g}"
 
 
-def _meaning(model: type[BaseModel], path: ParameterPath) -> str:
-    """The first sentence of a quantity's description, in brackets and without its unit."""
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
-    if field is None or not field.description or not isinstance(field.json_schema_extra, dict):
+def meaning_of(field: FieldInfo) -> str:
+    """The first sentence of a quantity's description, without its unit; empty for another field."""
+    if not field.description or not isinstance(field.json_schema_extra, dict):
         return ""
-    unit = f" [{field.json_schema_extra['unit']}]"
-    sentence = re.split(r"[.;] |\.$", " ".join(field.description.split()), maxsplit=1)[0]
+    sentence = re.split(r"\.(?: |$)", " ".join(field.description.split()), maxsplit=1)[0]
     if sentence[1:2].islower():  # no symbol and no abbreviation
         sentence = sentence[0].lower() + sentence[1:]
-    return f" ({sentence.removesuffix(unit)})"
+    return sentence.removesuffix(f" [{field.json_schema_extra['unit']}]")
 
 
 def _unit(model: type[BaseModel], path: ParameterPath) -> str:

@@ -4,10 +4,10 @@ import functools
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
+from train.runs.folders import installed_version
 
 _ROOT = Path(__file__).parents[2]
 _PHYSICS = ("elastic_env", "baselines", "train/evaluate")
@@ -49,14 +49,7 @@ def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str)
 
 def _library_versions() -> dict[str, str]:
     """Python and the libraries that calculate."""
-    return {"python": platform.python_version(), **{name: _version(name) for name in _LIBRARIES}}
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "none"
+    return {"python": platform.python_version(), **{name: installed_version(name) or "none" for name in _LIBRARIES}}
 
 
 def _digest(folders: Sequence[str]) -> str:
