@@ -16,11 +16,10 @@ from elastic_env import IDS
 from elastic_env.core.config import Model
 from elastic_env.core.signals import Signal
 from elastic_env.runtime.scenario import scenario_names
-from train.commands.cli import Command, main
+from train.commands.cli import COMMANDS, main
 
-COMMANDS = [command.__metadata__[0].name for command in get_args(Command)]
-"""All commands; the help of `hardware` stands in its parts."""
 HARDWARE = ("scan", "check", "run", "emulate")
+"""Parts of the command `hardware`, which have its help."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

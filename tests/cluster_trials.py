@@ -35,7 +35,7 @@ from train.evaluate.conditions import Condition, PolicySpec
 from train.report.change_tables import write_statistics
 from train.report.summary import write_episodes
 from train.workers.calls import Watch, run_calls
-from train.workers.places import Place
+from train.workers.executors import Executors
 
 ROOT, PROGRAMS = Path(__file__).parents[1], Path(sys.executable).parent
 SINE = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}
@@ -99,8 +99,8 @@ def _wait_for_port(port: int) -> None:
 
 
 @contextmanager
-def dask_cluster(workers: int, *options: str) -> Iterator[tuple[Place, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and workers of dask, real processes over TCP; its place, and the programs that keep workers going."""
+def dask_cluster(workers: int, *options: str) -> Iterator[tuple[Executors, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and workers of dask, real processes over TCP; executors on it, and what keeps workers going."""
     port = free_port()
     known = {**os.environ, "PYTHONPATH": str(ROOT)}  # the functions of the tests
     at, dask = f"127.0.0.1:{port}", str(PROGRAMS / "dask")
@@ -121,16 +121,16 @@ def dask_cluster(workers: int, *options: str) -> Iterator[tuple[Place, list[subp
         started = [subprocess.Popen(command, env=known, **QUIET) for command in commands]  # type: ignore[call-overload]
         try:
             _wait_for_port(port)
-            yield Place(f"dask://{at}"), started[1:]
+            yield Executors(f"dask://{at}"), started[1:]
         finally:
             for process in reversed(started):
                 process.terminate()
                 process.wait()
 
 
-def seconds_of(function: Callable[..., Any], given: list[tuple[Any, ...]], place: Place) -> float:
+def seconds_of(function: Callable[..., Any], given: list[tuple[Any, ...]], executors: Executors) -> float:
     """How long calls take, once a first one has had the worker load what it needs."""
-    with tempfile.TemporaryDirectory() as own, place.opened(len(given), Path(own)) as pool:
+    with tempfile.TemporaryDirectory() as own, executors.open(len(given), Path(own)) as pool:
         run_calls(empty, [(0,)], pool, Watch())
         begin = time.monotonic()
         outcomes = run_calls(function, given, pool, Watch())
@@ -141,10 +141,9 @@ def seconds_of(function: Callable[..., Any], given: list[tuple[Any, ...]], place
 
 def overhead(function: Callable[..., Any], given: list[tuple[Any, ...]], rounds: int) -> None:
     """Both places in turn, with one process each; seconds of every round and their medians."""
-    with dask_cluster(1) as (place, _):
-        pairs = [
-            (seconds_of(function, given, Place(jobs=1)), seconds_of(function, given, place)) for _ in range(rounds)
-        ]
+    with dask_cluster(1) as (executors, _):
+        both = (Executors(jobs=1), executors)
+        pairs = [[seconds_of(function, given, own) for own in both] for _ in range(rounds)]
     for local, dask in pairs:
         print(f"local {local:.2f} s, dask {dask:.2f} s, dask/local {dask / local:.3f}")
     local, dask = (statistics.median(pair[n] for pair in pairs) for n in (0, 1))
@@ -171,20 +170,20 @@ class Comparison:
         ]
         return [Condition(policy=policy, reference=SINE, episodes=2) for policy in policies]
 
-    def play(self, place: Place) -> None:
+    def play(self, executors: Executors) -> None:
         """As `elastic compare` does: what is not kept is played, then tables are written."""
-        found = run_conditions(self.conditions(), Console(quiet=True), place, Store(self.folder / "cells"))
+        found = run_conditions(self.conditions(), Console(quiet=True), executors, Store(self.folder / "cells"))
         write_episodes(found, self.folder / TABLES[0])
         write_statistics(changes(found, {}), self.folder / TABLES[1])
 
-    def begin(self, place: Place) -> int:
+    def begin(self, executors: Executors) -> int:
         """Play in a process of its own, a fork of this one; its number."""
         self.folder.mkdir(exist_ok=True)
         assert threading.active_count() == 1, "a fork has no other threads"
         process = os.fork()
         if process == 0:
             try:
-                self.play(place)
+                self.play(executors)
             except BaseException as error:
                 print(f"{type(error).__name__}: {error}", file=sys.stderr)
                 os._exit(1)
@@ -226,11 +225,11 @@ def _kill_worker(nanny: subprocess.Popen[bytes]) -> bool:
     return False
 
 
-def _undisturbed(place: Place) -> tuple[list[bytes], float]:
+def _undisturbed(executors: Executors) -> tuple[list[bytes], float]:
     """Tables of a comparison that nobody disturbs, and how long its cells take once the workers have loaded all."""
-    _ended(Comparison(Path.cwd() / "first").begin(place))
+    _ended(Comparison(Path.cwd() / "first").begin(executors))
     whole = Comparison(Path.cwd() / "whole")
-    process = whole.begin(place)
+    process = whole.begin(executors)
     _wait_for_begin(whole)
     begin = time.monotonic()
     code = _ended(process)
@@ -253,11 +252,11 @@ def _own_folder() -> Iterator[None]:
 def workers(times: int, seed: int) -> None:
     """Kill a worker at a random moment of a comparison, and look at what comes of it."""
     chance, same, again = random.Random(seed), 0, list[int]()
-    with _own_folder(), dask_cluster(2) as (place, nannies):
-        tables, lasted = _undisturbed(place)
+    with _own_folder(), dask_cluster(2) as (executors, nannies):
+        tables, lasted = _undisturbed(executors)
         for number in range(times):
             played = Comparison(Path.cwd() / f"trial_{number}")
-            process = played.begin(place)
+            process = played.begin(executors)
             _wait_for_begin(played)
             moment = chance.uniform(0.0, lasted)
             time.sleep(moment)
@@ -275,11 +274,11 @@ def workers(times: int, seed: int) -> None:
 def program(times: int, seed: int) -> None:
     """Kill the program itself at a random moment, resume it, and look at what comes of it."""
     chance, same, again, wasted = random.Random(seed), 0, list[int](), 0
-    with _own_folder(), dask_cluster(2) as (place, _):
-        tables, lasted = _undisturbed(place)
+    with _own_folder(), dask_cluster(2) as (executors, _):
+        tables, lasted = _undisturbed(executors)
         for number in range(times):
             played = Comparison(Path.cwd() / f"trial_{number}")
-            process = played.begin(place)
+            process = played.begin(executors)
             _wait_for_begin(played)
             moment = chance.uniform(0.0, lasted)
             time.sleep(moment)
@@ -288,7 +287,7 @@ def program(times: int, seed: int) -> None:
             finished = played.finished()
             time.sleep(2.0)  # what runs on the workers ends, and begins no other
             before = len(played.begun())
-            code = _ended(played.begin(place))
+            code = _ended(played.begin(executors))
             begun = len(played.begun())
             again.append(begun - CELLS)
             wasted += begun - before - (CELLS - finished)

@@ -24,7 +24,7 @@ from baselines.identification.arm_result import described
 from elastic_env.core.signals import Array, BoolArray
 from elastic_env.core.yaml_text import parse_yaml
 from tests.test_arm_identification import ARM, FOLDER, JOINTS, K, equilibria, log_of, model_of, poses, shown
-from train.experiments.identify_arm import IdentifyArmConfig, run_arm_identification
+from train.commands.identify_arm import ArmOptions, run_arm_identification
 from train.runs.escaping import write_records
 
 POSES, UNUSED, WITHIN = 40, 50, 0.03
@@ -56,11 +56,11 @@ class Trial:
 
 def planned_poses() -> Array:
     """Motor angles that `elastic identify --plan` proposes without a log, (40, n) [rad]."""
-    config = IdentifyArmConfig(
+    config = ArmOptions(
         robot=str(FOLDER / "arm.xml"), end_effector="marker", measured_by="end_effector", plan=POSES
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        run_arm_identification(config, Console(quiet=True), Path(folder) / "plan")
+        run_arm_identification(config, Console(quiet=True), output=Path(folder) / "plan")
         with (Path(folder) / "plan" / "plan.csv").open(newline="", encoding="utf-8") as file:
             return np.array([[float(row[f"theta.{joint} [rad]"]) for joint in JOINTS] for row in csv.DictReader(file)])
 

@@ -22,10 +22,10 @@ from baselines.policies import RESIDUAL
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.yaml_text import parse_yaml
+from train.commands.bench import BenchConfig
+from train.commands.compare import CompareConfig, try_out
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.families import expand, origin
-from train.experiments.bench import BenchConfig
-from train.experiments.compare import CompareConfig, try_out
 from train.learn.train_config import TrainConfig, training_worlds
 
 ROOT = Path(__file__).parents[1]

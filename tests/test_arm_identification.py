@@ -35,7 +35,7 @@ from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.joint.make_elastic import make_elastic
 from train.commands.cli import main
-from train.experiments.identify_arm import result_table
+from train.commands.identify_arm import result_table
 from train.figures.arm_plots import deflections
 
 FOLDER = Path(__file__).parents[1] / "docs" / "identification"

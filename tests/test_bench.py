@@ -9,8 +9,8 @@ import yaml
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
+from train.commands.bench import BenchConfig, configuration
 from train.commands.cli import main
-from train.experiments.bench import BenchConfig, configuration
 
 ROOT = Path(__file__).parents[1]
 QUICK = {"kind": "sine", "duration_s": 0.5, "onset_s": 0.5, "amplitude": 0.1}

@@ -12,16 +12,16 @@ import pytest
 
 from elastic_env.core.errors import ElasticError
 from tests.test_training import PPO, SMALL, interrupted_after
-from train.learn.checkpoint import recovered, require_whole, written
+from train.learn.checkpoint import recover_checkpoint, require_whole, write_checkpoint
 from train.learn.train_config import TrainConfig
 from train.learn.training import Training
-from train.runs.failures import SYSTEM_FAILED, explained
+from train.runs.failures import SYSTEM_FAILED, explain
 
 MUTATIONS, FULL_DISKS = 300, 3
 
 
 def write(checkpoint: Path, text: str) -> None:
-    with written(checkpoint) as fresh:
+    with write_checkpoint(checkpoint) as fresh:
         (fresh / "one").write_text(text)
         (fresh / "two.json").write_text('{"count": 1}')
 
@@ -93,7 +93,7 @@ def test_a_failure_on_the_way_leaves_the_checkpoint_before_it(tmp_path: Path) ->
     write(checkpoint, "first")
     with pytest.raises(TypeError):
         write(checkpoint, None)  # type: ignore[arg-type]
-    assert recovered(checkpoint)
+    assert recover_checkpoint(checkpoint)
     require_whole(checkpoint)
     assert (checkpoint / "one").read_text() == "first"
     write(checkpoint, "third")
@@ -103,10 +103,10 @@ def test_a_failure_on_the_way_leaves_the_checkpoint_before_it(tmp_path: Path) ->
 def test_a_kill_between_the_moves_loses_nothing(tmp_path: Path) -> None:
     """Catches a checkpoint that is only found under its own name."""
     checkpoint = tmp_path / "checkpoint"
-    assert not recovered(checkpoint)
+    assert not recover_checkpoint(checkpoint)
     write(checkpoint, "first")
     checkpoint.rename(tmp_path / "checkpoint.old")
-    assert recovered(checkpoint)
+    assert recover_checkpoint(checkpoint)
     require_whole(checkpoint)
 
 
@@ -139,9 +139,9 @@ def test_a_full_disk_is_one_sentence_and_the_training_goes_on(
     Training(config, 1, tmp_path / "whole").run()
     for number in range(FULL_DISKS):
         folder, size = tmp_path / str(number), chance.choice([0, 300, 3_000, 30_000, chance.randrange(60_000)])
-        with full_beyond(size), pytest.raises(Exception) as caught:  # noqa: PT011  `explained` judges it
+        with full_beyond(size), pytest.raises(Exception) as caught:  # noqa: PT011  `explain` judges it
             Training(config, 1, folder).run()
-        found = explained(caught.value)
+        found = explain(caught.value)
         assert found is not None, caught.value
         assert found[0].count("\n") == 0
         assert found[1] == SYSTEM_FAILED

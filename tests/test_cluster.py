@@ -31,7 +31,7 @@ from train.learn.train_config import TrainConfig
 from train.learn.training import Training
 from train.workers.calls import Watch, WorkerKilledError, run_calls
 from train.workers.dask_cluster import warn_of_public
-from train.workers.places import Place
+from train.workers.executors import Executors
 from train.workers.versions import VersionsDifferError, require_same
 
 CONDITIONS = [
@@ -40,10 +40,10 @@ CONDITIONS = [
 
 
 @pytest.fixture
-def dask() -> Iterator[Place]:
+def dask() -> Iterator[Executors]:
     """A scheduler and two workers."""
-    with dask_cluster(2) as (place, _):
-        yield place
+    with dask_cluster(2) as (executors, _):
+        yield executors
 
 
 def killed_once(mark: str, report: Callable[[int], None]) -> int:
@@ -60,12 +60,14 @@ def always_killed(kills: bool, report: Callable[[int], None]) -> str:
     return "fine"
 
 
-def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone(dask: Place, tmp_path: Path) -> None:
+def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone(
+    dask: Executors, tmp_path: Path
+) -> None:
     """Catches results that depend on the place, and a call that is lost with its worker."""
     expected = [evaluate(condition, num_threads=1) for condition in CONDITIONS]
     found = run_conditions(CONDITIONS, Console(quiet=True), dask)
     assert [e.episodes for e in found] == [e.episodes for e in expected]
-    with dask.opened(3, tmp_path) as pool:
+    with dask.open(3, tmp_path) as pool:
         outcomes = run_calls(killed_once, [("",), (str(tmp_path / "mark"),), ("",)], pool, Watch())
     assert [outcome is not None and outcome.error is None for outcome in outcomes] == [True] * 3
     assert (tmp_path / "mark").exists()
@@ -74,7 +76,7 @@ def test_cells_are_the_same_on_dask_and_a_killed_worker_costs_its_own_call_alone
 def test_a_call_that_kills_its_process_each_time_fails_alone(tmp_path: Path) -> None:
     """Catches calls that are tried for ever, and others that go with it."""
     moved: list[int] = []
-    with Place(jobs=2).opened(3, tmp_path) as pool:
+    with Executors(jobs=2).open(3, tmp_path) as pool:
         outcomes = run_calls(always_killed, [(False,), (True,), (False,)], pool, Watch(moved=moved.append))
     assert moved == [1, 1]
     assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine", None, "fine"]
@@ -100,7 +102,7 @@ def test_a_comparison_on_this_machine_needs_no_process_but_its_workers(tmp_path:
     """Catches a call that fails, with an error of its connection, where a helper of the program is killed."""
     known, reports = processes_of(os.getpid()), list[Any]()
     watch = Watch(reported=lambda number, value: reports.append((number, value)))
-    with Place(jobs=1).opened(2, tmp_path) as pool:
+    with Executors(jobs=1).open(2, tmp_path) as pool:
         outcomes = run_calls(helpers_killed, [(known,)] * 2, pool, watch)
     assert [outcome.value for outcome in outcomes if outcome is not None] == ["fine"] * 2
     assert reports == [(0, 0), (0, 1), (1, 0), (1, 1)]
@@ -178,20 +180,26 @@ def test_other_versions_are_refused_with_both() -> None:
 @pytest.mark.parametrize("on", ["dask://nowhere", "ssh://host:1", "slurmy", ""])
 def test_a_place_that_does_not_exist_says_which_do(on: str) -> None:
     with pytest.raises(ConfigurationError, match="on must be local, dask://HOST:PORT"):
-        Place(on)
+        Executors(on)
 
 
 @pytest.mark.parametrize(
-    ("place", "calls", "threads"),
-    [(Place(), 1, 8), (Place(), 3, 2), (Place(), 20, 1), (Place(jobs=2), 20, 4), (Place(jobs=12), 20, 1),
-     (Place("dask://host:1"), 1, 1)],
-)  # fmt: skip
+    ("executors", "calls", "threads"),
+    [
+        (Executors(), 1, 8),
+        (Executors(), 3, 2),
+        (Executors(), 20, 1),
+        (Executors(jobs=2), 20, 4),
+        (Executors(jobs=12), 20, 1),
+        (Executors("dask://host:1"), 1, 1),
+    ],
+)
 def test_calls_share_the_cores_of_this_machine(
-    place: Place, calls: int, threads: int, monkeypatch: pytest.MonkeyPatch
+    executors: Executors, calls: int, threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches cores that stand idle beside one training seed, and more threads than cores."""
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert place.threads_per_call(calls) == threads
+    assert executors.threads_per_call(calls) == threads
 
 
 def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +207,7 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypat
     port = free_port()
     with (
         pytest.raises(SystemFailedError, match=f"no dask scheduler answers at 127.0.0.1:{port}"),
-        Place(f"dask://127.0.0.1:{port}").opened(1, tmp_path),
+        Executors(f"dask://127.0.0.1:{port}").open(1, tmp_path),
     ):
         pass
 
@@ -216,9 +224,9 @@ def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
     """Catches versions of workers that nobody looks at."""
     (tmp_path / "other.py").write_text(OTHER_NUMPY)
     with (
-        dask_cluster(1, "--no-nanny", "--preload", str(tmp_path / "other.py")) as (place, _),
+        dask_cluster(1, "--no-nanny", "--preload", str(tmp_path / "other.py")) as (executors, _),
         pytest.raises(VersionsDifferError, match=r"on tcp://.*: numpy 1\.0\.7 there, .* here; install the same commit"),
-        place.opened(1, tmp_path),
+        executors.open(1, tmp_path),
     ):
         pass
 
@@ -296,7 +304,7 @@ def test_a_training_seed_whose_worker_is_killed_ends_with_the_same_weights(
 
     killer = threading.Thread(target=kill)
     killer.start()
-    start([config], Console(), tmp_path / "run", Place(jobs=2))
+    start([config], Console(), tmp_path / "run", Executors(jobs=2))
     killer.join()
     assert "a worker was lost; seed 3 goes on from its checkpoint" in capsys.readouterr().out
     Training(config, 3, tmp_path / "alone").run()

@@ -17,13 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-import train.experiments.compare
+import train.commands.compare
 from baselines.catalogue import BEST_ON_THE_WALKER
 from baselines.residual.residual import read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, MissingExtraError
 from tests.cells import METRIC, cell, describe, episode_rows, family, records
 from train.commands.cli import main
+from train.commands.compare import CompareConfig, _each_once
 from train.evaluate.changes import CEILING, SAME_ROBOT, Change, changes, merge_seeds, pair, percent_interval
 from train.evaluate.conditions import Condition, Member, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
@@ -31,7 +32,6 @@ from train.evaluate.families import expand
 from train.evaluate.progress import learning_curves
 from train.evaluate.statistics import Estimate, change, improvement, interquartile_mean, over_seeds, wins
 from train.evaluate.table import EpisodeTable, score
-from train.experiments.compare import CompareConfig, _each_once
 from train.figures.comparison_figures import has_swept_references
 from train.report import Results, require_jinja2, require_plotly, write_report
 from train.report.change_tables import cells_table, changes_table, print_changes, write_statistics
@@ -606,8 +606,8 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
         patch.chdir(root)
-        patch.setattr(train.experiments.compare, "run_conditions", run)
-        patch.setattr("train.commands.playing.CONSOLE", Console(width=160, file=file))
+        patch.setattr(train.commands.compare, "run_conditions", run)
+        patch.setattr("train.commands.cli.CONSOLE", Console(width=160, file=file))
         main(["compare", "two.yaml"])
     return root / "runs" / "two", (root / "printed.txt").read_text()
 

@@ -16,7 +16,7 @@ from elastic_env.core.yaml_text import parse_yaml
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.thormang.environment import configure_walk
-from train.experiments.compare import CompareConfig
+from train.commands.compare import CompareConfig
 from train.learn.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]

@@ -21,7 +21,7 @@ from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from train.commands.cli import main
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import PolicyFailedError, policy_errors
-from train.runs.failures import EndedError, explained
+from train.runs.failures import EndedError, explain
 from train.runs.progress import duration, plain_progress
 from train.workers.calls import WorkerKilledError
 
@@ -114,7 +114,7 @@ def several(*commands: tuple[int | None, list[str]], first: str = "", **options:
     ],
 )
 def test_a_failure_is_a_sentence_and_a_code(error: Exception, said: str, code: int) -> None:
-    found = explained(error)
+    found = explain(error)
     assert found is not None
     assert said in found[0]
     assert found[1] == code
@@ -124,8 +124,8 @@ def test_a_full_disk_is_found_behind_the_error_of_a_library() -> None:
     """Catches a library that hides why it could not write."""
     error, cause = RuntimeError("writer failed"), OSError(errno.ENOSPC, "No space left on device")
     error.__cause__ = cause
-    assert explained(error) == explained(cause)
-    assert explained(RuntimeError("a defect")) is None
+    assert explain(error) == explain(cause)
+    assert explain(RuntimeError("a defect")) is None
 
 
 def test_a_policy_that_fails_is_named_with_scenario_and_step(tmp_path: Path) -> None:
@@ -248,8 +248,8 @@ def test_an_interrupt_that_c_code_quotes_is_an_interrupt(asked: type[KeyboardInt
     function.argtypes = [Interrupted]
     with pytest.raises(ctypes.ArgumentError) as caught:
         function(1)
-    assert explained(caught.value) == ("interrupted", 130)
-    assert explained(ctypes.ArgumentError("argument 1: TypeError: wrong type")) is None
+    assert explain(caught.value) == ("interrupted", 130)
+    assert explain(ctypes.ArgumentError("argument 1: TypeError: wrong type")) is None
 
 
 def limited(size: int) -> Callable[[], None]:

@@ -25,7 +25,7 @@ from elastic_env.robots.testbed.model import Pendulum
 from tests.test_hardware_safety import states
 from tests.test_hardware_supervisor import ENABLE, attached, served
 from tests.test_hardware_testbed import StillBus, make_still, still  # noqa: F401  a fixture
-from train.hardware import emulate
+from train.commands.hardware import emulate
 
 NO_NUMBERS = [math.nan, math.inf, -math.inf]
 no_number = pytest.mark.parametrize("value", NO_NUMBERS)

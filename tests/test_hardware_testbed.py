@@ -35,8 +35,8 @@ from tests.busy import once_more
 from tests.hardware_trials import trials as hardware_trials
 from tests.hardware_trials.__main__ import prove
 from train.commands.cli import main
-from train.experiments.identify import IdentifyConfig, identified_environments
-from train.hardware import hardware_arguments
+from train.commands.identify import Identify, identified_environments
+from train.commands.options import OnHardware
 
 QUICK = {"kind": "sine", "amplitude": 0.1, "frequency_hz": 0.5, "duration_s": 0.3, "onset_s": 0.4}
 PATIENT = {"patience_cycles": 10, "hang_s": 0.09}
@@ -323,8 +323,8 @@ def test_mounting_turns_angles_into_the_joints() -> None:
 def test_identification_takes_the_pendulum_that_is_mounted(tmp_path: Path) -> None:
     """Catches K that is found with the torque of another pendulum."""
     (tmp_path / "m.yaml").write_text("port: /dev/a\nimu_port: /dev/b\npendulum: {gravity_torque: 52.0, mass: 8.0}\n")
-    arguments = hardware_arguments(None, None, tmp_path / "m.yaml", yes=False)
-    envs = identified_environments(IdentifyConfig(hardware=arguments, second_mass=0.5))
+    on = OnHardware(mounting=tmp_path / "m.yaml")
+    envs = identified_environments(Identify(on=on, second_mass=0.5))
     pendulums = [env.unwrapped.task.config.pendulum for env in envs]
     assert [(p.gravity_torque, p.mass) for p in pendulums] == [(52.0, 8.0), (26.0, 4.0)]
 
@@ -348,12 +348,12 @@ def test_commands_run_on_hardware(
         "limits: {patience_cycles: 10, hang_s: 0.09, slew_rad_s: 2.5}\npendulum: {gravity_torque: 60.0, mass: 11.0}\n"
     )
     options = ["--mounting", "mounting.yaml", "--imu-port", emulator.imu_port, "--yes"]
-    assert hardware_arguments(None, None, Path("mounting.yaml"), yes=True)["limits"]["slew_rad_s"] == 2.5
-    patient = hardware_arguments(None, None, Path("mounting.yaml"), yes=True, patient=True)
+    assert OnHardware(mounting=Path("mounting.yaml"), yes=True).arguments["limits"]["slew_rad_s"] == 2.5
+    patient = OnHardware(mounting=Path("mounting.yaml"), yes=True, patient=True).arguments
     assert [patient["limits"][name] for name in ("patience_cycles", "slew_rad_s")] == [10, 2.5]
     assert patient["imu_oldest_s"] == 0.3  # as the file says, which is more patient still
-    assert hardware_arguments("p", None, None, yes=True, patient=True)["imu_oldest_s"] == 0.2
-    assert "pendulum" not in hardware_arguments(emulator.port, None, None, yes=True)  # a configuration may say it
+    assert OnHardware(port="p", yes=True, patient=True).arguments["imu_oldest_s"] == 0.2
+    assert "pendulum" not in OnHardware(port=emulator.port, yes=True).arguments  # a configuration may say it
     reference = ["--reference", json.dumps(QUICK)]
     command(["evaluate", "--policy", f"residual:{residual}", *reference, *options, "--output", "evaluated"], capsys)
     (episode,) = csv.DictReader(Path("evaluated/episodes.csv").read_text().splitlines())
@@ -373,7 +373,7 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
     """Catches --port that is looked at after the file was refused for having none, and errors without a cure."""
     mounting = tmp_path / "mounting.yaml"
     mounting.write_text("direction: -1\n")
-    given = hardware_arguments("/dev/ttyUSB7", "/dev/ttyACM7", mounting, yes=False)
+    given = OnHardware(port="/dev/ttyUSB7", imu_port="/dev/ttyACM7", mounting=mounting).arguments
     assert (given["port"], given["imu_port"], given["direction"]) == ("/dev/ttyUSB7", "/dev/ttyACM7", -1)
     for text, port, words in (
         ("direction: -1", None, "'port': .* --port"),
@@ -385,9 +385,9 @@ def test_a_mounting_needs_no_port_of_its_own(tmp_path: Path) -> None:
     ):
         mounting.write_text(text)
         with pytest.raises(ConfigurationError, match=words):
-            hardware_arguments(port, None, mounting, yes=False)
+            _ = OnHardware(port=port, mounting=mounting).arguments
     with pytest.raises(ConfigurationError, match="is a folder"):
-        hardware_arguments("p", None, tmp_path, yes=False)
+        _ = OnHardware(port="p", mounting=tmp_path).arguments
 
 
 @pytest.mark.parametrize(("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM")])

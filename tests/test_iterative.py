@@ -20,9 +20,9 @@ from baselines.policies import Track, track
 from baselines.walking.zmp_shift import center_of_mass_shift
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from train.commands.iterate import Iterate
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
-from train.experiments.iterate import IterateConfig, iterate
 
 PERIOD_S = 0.004
 SINE = {"kind": "sine", "amplitude": 0.2, "duration_s": 1.5, "onset_s": 0.5}
@@ -258,8 +258,8 @@ def test_a_push_in_one_trial_is_forgotten() -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of `elastic iterate` on the testbed."""
     folder = tmp_path_factory.mktemp("runs") / "iterate"
-    config = IterateConfig(env="testbed", scenario="soft", reference=SINE, learning=SHORT, seed=3)
-    iterate(config, Console(quiet=True), folder)
+    options = Iterate(env="testbed", scenario="soft", reference=SINE, trials=SHORT.trials, seed=3, output=folder)
+    options.run(Console(quiet=True))
     return folder
 
 
@@ -319,6 +319,6 @@ def test_damaged_files_say_what_is_wrong(run: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_learned_is_refused() -> None:
     """Catches a motion that differs from seed to seed, a base that has learned, and links that nothing shows."""
     with pytest.raises(ConfigurationError, match="draws another motion"):
-        IterateConfig(env="testbed", reference="multisine")
+        Iterate(env="testbed", reference="multisine")
     with pytest.raises(ConfigurationError, match="base of iterative"):
         baselines.make("iterative", make_testbed(), learned_base="oracle")

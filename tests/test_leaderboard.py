@@ -12,20 +12,19 @@ import pytest
 import yaml
 from rich.console import Console
 
-import train.experiments.compare
-import train.experiments.timing
+import train.commands.compare
+import train.speed.step_times
 from baselines.catalogue import Track
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from tests.cells import METRIC, cell, family
 from train.commands.cli import main
+from train.commands.compare import CompareConfig, Sweep
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.standings import Paired, Standing, standings
 from train.evaluate.statistics import Estimate, over_seeds
-from train.experiments.compare import CompareConfig, Sweep
-from train.experiments.timing import step_times
 from train.report import Results, write_report
 from train.report.leaderboard import (
     board,
@@ -39,6 +38,7 @@ from train.report.leaderboard import (
 )
 from train.report.render import Cell, Table, plain_text
 from train.runs.folders import run_folder
+from train.speed.step_times import step_times
 
 ROOT = Path(__file__).parents[1]
 GROUPS = {"both": ["soft", "ideal"], "all": ["soft", "ideal", "slope"]}
@@ -309,7 +309,7 @@ class Scripted:
 
 def test_times_are_medians_of_rounds_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches one policy after the other, compiling that is timed, a mean, and times of the whole round."""
-    monkeypatch.setattr(train.experiments.timing, "_Player", Scripted)
+    monkeypatch.setattr(train.speed.step_times, "_Player", Scripted)
     conditions = [Condition(env="walker", policy=PolicySpec(name="zero", label=title)) for title in ("a", "b", "a")]
     assert step_times(conditions, steps=10, rounds=3) == pytest.approx({"a": 2.0, "b": 5.0})
     assert Scripted.log == ["a", "b"] * 4 + ["close a", "close b"]
@@ -333,9 +333,9 @@ def test_a_policy_of_ones_own_gets_a_row_by_one_line(monkeypatch: pytest.MonkeyP
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
-    monkeypatch.setattr(train.experiments.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1))
-    monkeypatch.setattr(train.experiments.compare, "draw_figures", lambda *_: [])
+    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.compare, "step_times", lambda cells: step_times(cells, steps=2, rounds=1))
+    monkeypatch.setattr(train.commands.compare, "draw_figures", lambda *_: [])
     main(["compare", "board.yaml"])
     folder = Path("runs/board")
     with (folder / "leaderboard.csv").open(newline="") as file:

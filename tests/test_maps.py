@@ -15,13 +15,13 @@ from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.runtime.scenario import make_scenario
 from tests.cells import METRIC, cell, family
+from train.commands.compare import CompareConfig
 from train.evaluate.changes import changes
 from train.evaluate.conditions import Condition, PolicySpec, scenario_fields, varied
 from train.evaluate.episodes import Evaluation
 from train.evaluate.maps import HeatMap, MapConfig, best_of, heat_maps
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate
-from train.experiments.compare import CompareConfig
 from train.figures.comparison_figures import draw_maps
 from train.figures.map_plots import Square, blend, panels
 from train.report import Results, write_report

@@ -16,12 +16,12 @@ from elastic_env.core import installed
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ElasticError, listed, missing_extra, shortened, shown, unknown_name
 from elastic_env.robots.gallery import gallery_robot
+from train.commands.bench import BenchConfig
 from train.commands.cli import main
+from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import make_policy
-from train.experiments.bench import BenchConfig
-from train.experiments.compare import CompareConfig
 from train.learn.algorithms import algorithm_class
 from train.learn.train_config import TrainConfig
 
@@ -157,8 +157,8 @@ def test_configurations_are_where_a_message_says(monkeypatch: pytest.MonkeyPatch
     assert said("configs/papr.yaml").endswith(f"; those of elastic-env are in {root / 'configs'}")
     assert said("mine.yaml") == "no configuration file at mine.yaml"
     monkeypatch.setattr(installed, "checkout", lambda: None)
-    own = PackagePath("train/experiments/bench.yaml")
+    own = PackagePath("train/commands/bench.yaml")
     own.dist = SimpleNamespace(locate_file=lambda path: Path(os.sep, "site", path))  # type: ignore[assignment]
     monkeypatch.setattr(installed, "files", lambda _: [own])
     assert "the folder configs is in the source of elastic-env" in said("configs/paper.yaml")
-    assert said("configs/paper.yaml").endswith("With the package come /site/train/experiments/bench.yaml")
+    assert said("configs/paper.yaml").endswith("With the package come /site/train/commands/bench.yaml")

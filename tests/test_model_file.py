@@ -20,7 +20,7 @@ from elastic_env import ElasticJoint, make_elastic
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.joint.known_torque import coupled_fingers
 from elastic_env.joint.model_file import compiled_model, read_model
-from train.experiments.robot import RobotTrial, robot_arguments, write_robot
+from train.commands.robot import Robot, robot_arguments, write_robot
 
 INERTIAL = (
     '<inertial><origin xyz="0 0 0.15"/><mass value="{}"/>'
@@ -453,12 +453,12 @@ def test_warnings_of_mujoco_write_no_file(tmp_path: Path, monkeypatch: pytest.Mo
 def test_the_command_takes_the_text_of_a_model_and_does_not_print_it(tmp_path: Path) -> None:
     """Catches a mark or a declared encoding that the written file does not have, and a flood on the terminal."""
     text = urdf(head='\ufeff<?xml version="1.0" encoding="gbk"?>\n')
-    arguments = robot_arguments(RobotTrial(model=text, stiffness=400.0))
+    arguments = robot_arguments(Robot(model=text, stiffness=400.0))
     file = write_robot(arguments, tmp_path)
     np.testing.assert_allclose(torque(tmp_path / "model.xml"), TORQUE, rtol=1e-7)
     assert file.name == "robot.yaml"
     with pytest.raises(ConfigurationError) as error:
-        robot_arguments(RobotTrial(model="x" * 5_000, stiffness=400.0))
+        robot_arguments(Robot(model="x" * 5_000, stiffness=400.0))
     assert len(str(error.value)) < 700
 
 

@@ -19,12 +19,12 @@ from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.json_text import parse_json
 from elastic_env.runtime.physics import substeps
 from tests.mutations import RESIDUALS
+from train.commands.bench import BenchConfig
+from train.commands.compare import CompareConfig
 from train.evaluate.conditions import PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.families import expand
 from train.evaluate.rollout import make_policy
-from train.experiments.bench import BenchConfig
-from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds
 from train.runs.kinds import TELLING
 

@@ -7,9 +7,9 @@ from rich.console import Console
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from train.experiments.compare import CompareConfig
-from train.experiments.residuals import CONFIGS, RESIDUALS, beside_the_shipped, main, reproduce, shipped_seeds
-from train.workers.places import Place
+from train.commands.compare import CompareConfig
+from train.commands.residuals import CONFIGS, RESIDUALS, beside_the_shipped, main, reproduce, shipped_seeds
+from train.workers.executors import Executors
 
 TRAINING = """\
 name: train_testbed
@@ -39,7 +39,7 @@ def test_a_residual_stands_beside_the_one_of_the_package_and_a_second_call_goes_
     (tmp_path / "learned_testbed.yaml").write_text(COMPARISON)
 
     def played() -> dict[str, float]:
-        made = reproduce("testbed", tmp_path, Console(quiet=True), [3], Place(jobs=1), configs=tmp_path)
+        made = reproduce("testbed", tmp_path, Console(quiet=True), [3], Executors(jobs=1), configs=tmp_path)
         return {one.condition.policy.title: one.values("link_error_rms_rad")[0] for one in made.evaluations}
 
     first = played()

@@ -16,6 +16,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.config import robot_bank
 from elastic_env.runtime.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, episode_rows, family, records
+from train.commands.compare import CompareConfig
 from train.evaluate.changes import HELD_OUT, changes
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import evaluate
@@ -23,7 +24,6 @@ from train.evaluate.families import Origin
 from train.evaluate.robots import robot_scores, share_better
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.statistics import Estimate, interquartile_mean, over_seeds, worst_share_mean
-from train.experiments.compare import CompareConfig
 from train.learn.train_config import TrainConfig, training_worlds
 from train.report import Results, write_report
 from train.report.score_tables import print_robots, robots_table, write_robots

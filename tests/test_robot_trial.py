@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import train.experiments.compare
+import train.commands.compare
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
@@ -21,10 +21,10 @@ from elastic_env.robots.robot.environment import EXAMPLE, configure_robot
 from elastic_env.runtime.joint_task import JointPlant
 from tests.gallery_files import FOLDER
 from train.commands.cli import main
+from train.commands.robot import POLICIES, Robot, joint_shares, rest_poses, robot_arguments, try_robot
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import environment
 from train.evaluate.episodes import Evaluation, evaluate
-from train.experiments.robot import POLICIES, RobotTrial, joint_shares, rest_poses, robot_arguments, try_robot
 
 QUICK, SEVERAL = Poses(positions=1, move_s=0.8, settle_s=0.6, measure_s=0.1), Poses(positions=5)
 SINE = {"kind": "sine", "amplitude": 0.1, "duration_s": 0.5, "onset_s": 0.25}
@@ -44,10 +44,11 @@ def rows(file: Path) -> list[dict[str, str]]:
 def tried(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Folder of the made-up arm, and what was printed."""
     root = tmp_path_factory.mktemp("robot")
-    trial = RobotTrial(model=str(EXAMPLE), stiffness=str(JOINTS), end_effector="tool", poses=QUICK, motion=SINE)
+    files = {"model": str(EXAMPLE), "stiffness": str(JOINTS), "output": root / "arm"}
+    trial = Robot(**files, end_effector="tool", poses=QUICK, motion=SINE)
     with pytest.MonkeyPatch.context() as patch, (root / "printed.txt").open("w") as file:
-        patch.setattr(train.experiments.compare, "run_conditions", in_this_process)
-        result = try_robot(trial, Console(width=160, file=file), root / "arm")
+        patch.setattr(train.commands.compare, "run_conditions", in_this_process)
+        result = try_robot(trial, Console(width=160, file=file))
     assert all(made.is_file() for made in result.files)
     return result.folder, (root / "printed.txt").read_text()
 
@@ -79,11 +80,11 @@ def test_the_folder_goes_on_with_other_commands(tried: tuple[Path, str]) -> None
     assert (folder / "comparison" / "report.html").is_file()
     again = configure_robot(**environment(str(folder / "robot.yaml")).arguments("poses"))
     given = configure_robot(str(EXAMPLE), str(JOINTS), end_effector="tool")
-    tried_again = configure_robot(**robot_arguments(RobotTrial(model=str(folder / "robot.yaml"))))
+    tried_again = configure_robot(**robot_arguments(Robot(model=str(folder / "robot.yaml"))))
     for config in (again, tried_again):
         assert config.joints == given.joints
         assert config.robot.end_effector == given.robot.end_effector
-    softer = configure_robot(**robot_arguments(RobotTrial(model=str(folder / "robot.yaml"), stiffness=300.0)))
+    softer = configure_robot(**robot_arguments(Robot(model=str(folder / "robot.yaml"), stiffness=300.0)))
     assert {joint.stiffness for joint in softer.joints.values()} == {300.0}
 
 
@@ -140,8 +141,8 @@ def test_the_robot_of_the_readme_is_what_its_command_plays(monkeypatch: pytest.M
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     (name,) = re.findall(r"&& elastic robot (\w+)$", readme, flags=re.MULTILINE)
     for function in (gallery_file, gallery_robot, gallery_joints):
-        monkeypatch.setattr(f"train.experiments.robot.{function.__name__}", partial(function, folder=FOLDER))
-    config = configure_robot(**robot_arguments(RobotTrial(model=name)), reference=SEVERAL)
+        monkeypatch.setattr(f"train.commands.robot.{function.__name__}", partial(function, folder=FOLDER))
+    config = configure_robot(**robot_arguments(Robot(model=name)), reference=SEVERAL)
     shares = joint_shares(config.robot.plant(config))
     assert len(shares) == 7
     assert sum(one.share for one in shares) == pytest.approx(1.0)
@@ -181,7 +182,7 @@ def test_a_wrong_input_says_what_to_do(
 
 def test_a_robot_of_the_gallery_brings_its_assumed_joints() -> None:
     """Catches joints of another robot, a home that is lost, and the tip of the end effector that is not placed."""
-    config = configure_robot(**robot_arguments(RobotTrial(model="pusher")))
+    config = configure_robot(**robot_arguments(Robot(model="pusher")))
     for name, joint in gallery_joints("pusher").items():
         assert isinstance(config.joints[name], ElasticJoint)
         assert config.joints[name].stiffness == joint.stiffness
@@ -193,4 +194,4 @@ def test_a_robot_of_the_gallery_brings_its_assumed_joints() -> None:
 def test_a_robot_without_a_stiffness_is_told_how_to_find_it() -> None:
     """Catches K that is made up for a robot of which nobody knows it."""
     with pytest.raises(ConfigurationError, match="elastic identify --robot"):
-        try_robot(RobotTrial(model=str(EXAMPLE)), Console(quiet=True))
+        try_robot(Robot(model=str(EXAMPLE)), Console(quiet=True))

@@ -14,9 +14,9 @@ from rich.console import Console
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.core.files import read_bounded, write_whole
-from train.experiments.compare import recorded
+from train.commands.compare import recorded_config
 from train.learn.run_training import resume
-from train.runs.folders import free_folder, locked, new_run, require_run
+from train.runs.folders import free_folder, lock_run, new_run, require_run
 
 
 @pytest.fixture(autouse=True)
@@ -83,8 +83,8 @@ def full_at(name: str) -> Callable[..., None]:
 HOLD = """
 import sys
 from pathlib import Path
-from train.runs.folders import locked
-with locked(Path(sys.argv[1])):
+from train.runs.folders import lock_run
+with lock_run(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -100,22 +100,22 @@ def test_a_run_is_worked_on_by_one_program_and_a_kill_frees_it(tmp_path: Path) -
         assert other.stdout.readline() == "held\n"
         with (
             pytest.raises(ConfigurationError, match=f"another program, process {other.pid} of .*, works on"),
-            locked(tmp_path),
+            lock_run(tmp_path),
         ):
             pass
         seed = tmp_path / "seed_3"
         seed.mkdir()
         with (
             pytest.raises(ConfigurationError, match=r"process \d+ of .*, works on .*seed_3"),
-            locked(seed),
-            locked(seed),
+            lock_run(seed),
+            lock_run(seed),
         ):
             pass
         threading.Timer(0.3, other.kill).start()
-        with locked(tmp_path, patience_s=60.0):
+        with lock_run(tmp_path, patience_s=60.0):
             pass
         other.wait()
-        with locked(tmp_path):
+        with lock_run(tmp_path):
             assert (tmp_path / ".lock").read_text() == f"{os.getpid()} of {platform.node()}\n"
 
 
@@ -163,7 +163,7 @@ def test_a_comparison_that_is_resumed_runs_no_code_of_its_folder(
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text(f"name: x\n{FIELDS[field].format(code)}\n")
     with pytest.raises(ConfigurationError, match=r"whose code would run.*--trust-code"):
-        recorded(tmp_path)
+        recorded_config(tmp_path)
     assert not mark.exists()
 
 
@@ -172,7 +172,7 @@ def test_a_robot_that_is_called_like_a_residual_is_code(tmp_path: Path, monkeypa
     mark = mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text("name: x\nenv: 'residual:evil.py:ROBOT'\n")
     with pytest.raises(ConfigurationError, match="whose code would run"):
-        recorded(tmp_path)
+        recorded_config(tmp_path)
     assert not mark.exists()
 
 
@@ -180,7 +180,7 @@ def test_a_comparison_that_is_trusted_runs_its_code(tmp_path: Path) -> None:
     """Catches a folder of one's own that cannot be gone on with."""
     mark_when_imported(tmp_path)
     (tmp_path / "config.yaml").write_text("name: x\npolicies: ['evil.py:make', 'residual:evil']\n")
-    assert recorded(tmp_path, trust_code=True).policies[0].name == "evil.py:make"
+    assert recorded_config(tmp_path, trust_code=True).policies[0].name == "evil.py:make"
 
 
 @pytest.mark.parametrize("place", ["summary.md", "cells", "cells/x.npz", ".lock", "config.yaml", "seed_0/best.new"])
@@ -193,7 +193,7 @@ def test_a_run_with_a_link_out_of_it_is_not_gone_on_with(place: str, tmp_path: P
     if place != "config.yaml":
         (run / "config.yaml").write_text("name: x\n")
     (run / place).symlink_to("../" * place.count("/") + "../mine")
-    for go_on in (recorded, lambda folder: resume([folder], Console(quiet=True))):
+    for go_on in (recorded_config, lambda folder: resume([folder], Console(quiet=True))):
         with pytest.raises(ConfigurationError, match=f"{place} is a link that leads out of .*run"):
             go_on(run)
     assert mine.read_text() == "name: x\n"
@@ -239,7 +239,7 @@ def test_a_lock_is_a_file_of_its_own(kind: str, tmp_path: Path) -> None:
         "pipe": lambda: os.mkfifo(lock),
         "folder": lock.mkdir,
     }[kind]()
-    with pytest.raises(ConfigurationError, match="must be a plain file with one name"), locked(tmp_path):
+    with pytest.raises(ConfigurationError, match="must be a plain file with one name"), lock_run(tmp_path):
         pass
     assert mine.read_text() == "mine"
 

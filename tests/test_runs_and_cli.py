@@ -22,12 +22,12 @@ import yaml
 from PIL import Image, ImageSequence
 from rich.console import Console
 
+import train.commands.compare
+import train.commands.demo
+import train.commands.speed
 import train.evaluate.episodes
-import train.experiments.compare
-import train.experiments.demo
 import train.report.summary
 import train.speed.contenders
-import train.speed.speed
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER
 from baselines.identification.identify import Identification
 from elastic_env.core.config import load_yaml
@@ -36,10 +36,10 @@ from elastic_env.core.signals import Array
 from elastic_env.runtime.joint_task import METRICS_OF_ONE as METRICS
 from tests.test_identification import synthetic
 from train.commands.cli import main
+from train.commands.compare import CompareConfig
+from train.commands.play import play
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
-from train.experiments.compare import CompareConfig
-from train.experiments.play import play
 from train.runs.folders import new_run, run_folder
 from train.runs.progress import show_progress
 from train.runs.warned import each_once, said_so_far
@@ -84,8 +84,8 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
-    monkeypatch.setattr(train.experiments.demo, "run_conditions", run)
+    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.demo, "run_conditions", run)
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -260,7 +260,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Compared:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         console = Console(width=200, record=True, quiet=False, file=(root / "printed.txt").open("w"))
-        patch.setattr("train.commands.playing.CONSOLE", console)
+        patch.setattr("train.commands.cli.CONSOLE", console)
         main(["compare", "small.yaml", "--jobs", "2"])
         console.file.close()
     return Compared(
@@ -384,9 +384,9 @@ def test_output_that_holds_results_is_refused_before_the_work(
     Path("taken").mkdir()
     Path("taken/notes.txt").write_text("keep me")
     for name in (
-        "train.experiments.compare.run_conditions",
-        "train.experiments.identify.identify",
-        "train.speed.speed.measure",
+        "train.commands.compare.run_conditions",
+        "train.commands.identify.identify",
+        "train.commands.speed.measure",
     ):
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail("the work began"))
     arguments = {"evaluate": ["--reference", COMMAND_SINE], "compare": ["c.yaml"]}.get(command, [])
@@ -526,7 +526,7 @@ def test_wrong_argument_says_what_and_which_choices(
 ) -> None:
     """Catches tracebacks, units that vanish as markup, names that are not listed, and folders left behind."""
     arguments, words = COMMANDS[case]
-    monkeypatch.setattr("train.experiments.identify.identify", lambda *_, **__: pytest.fail("the work began"))
+    monkeypatch.setattr("train.commands.identify.identify", lambda *_, **__: pytest.fail("the work began"))
     Path("good.yaml").write_text(yaml.safe_dump({"name": "c", "references": [SINE]}))
     message = refused(arguments, capsys)
     assert [word for word in words if word not in message] == []
@@ -722,7 +722,7 @@ def test_play_takes_one_step_at_least_and_the_episode_at_most(
     def film(env: Any, episode: Any, total: int, *_: Any) -> None:
         played.append((total, len(list(episode))))
 
-    monkeypatch.setattr("train.experiments.play._film", film)
+    monkeypatch.setattr("train.commands.play._film", film)
     play(condition(), Console(quiet=True), Path("x.gif"), max_s=max_s)
     assert played == [(steps, steps)]
 
@@ -738,15 +738,15 @@ def test_demo_prints_its_table_and_the_paths_of_its_figures(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a demonstration that breaks on the way; with short references, so that it takes seconds."""
-    monkeypatch.setattr(train.experiments.demo, "_STATIC", train.experiments.demo._STATIC.replace(references=[HOLD]))
-    monkeypatch.setattr(train.experiments.demo, "_MOTION", train.experiments.demo._MOTION.replace(references=[SINE]))
+    monkeypatch.setattr(train.commands.demo, "_STATIC", train.commands.demo._STATIC.replace(references=[HOLD]))
+    monkeypatch.setattr(train.commands.demo, "_MOTION", train.commands.demo._MOTION.replace(references=[SINE]))
     short_walk = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}
     monkeypatch.setattr(
-        train.experiments.demo, "_SLOW_WALK", train.experiments.demo._SLOW_WALK.replace(references=[short_walk])
+        train.commands.demo, "_SLOW_WALK", train.commands.demo._SLOW_WALK.replace(references=[short_walk])
     )
-    monkeypatch.setattr(train.experiments.demo, "_WALK", train.experiments.demo._WALK.replace(references=[short_walk]))
+    monkeypatch.setattr(train.commands.demo, "_WALK", train.commands.demo._WALK.replace(references=[short_walk]))
     monkeypatch.setattr(
-        train.experiments.demo, "_SOFT_WALK", train.experiments.demo._SOFT_WALK.replace(references=[short_walk])
+        train.commands.demo, "_SOFT_WALK", train.commands.demo._SOFT_WALK.replace(references=[short_walk])
     )
     main(["demo"])
     printed = capsys.readouterr().out

@@ -27,11 +27,11 @@ from baselines.residual.residual import load_residual
 from baselines.residual_env import ResidualVectorWrapper
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
+from train.commands.bench import BenchCase
 from train.commands.cli import main
 from train.evaluate.episodes import evaluate
 from train.evaluate.progress import read_progress
 from train.evaluate.rollout import make_vector_env
-from train.experiments.bench import BenchCase
 from train.learn.constant_search import ConstantSearch
 from train.learn.curves import Curves
 from train.learn.mixed_env import MixedVectorEnv, threads_of_each
@@ -41,8 +41,8 @@ from train.learn.sb3_env import SB3VecEnv
 from train.learn.scores import played_together
 from train.learn.train_config import TrainConfig, training_worlds
 from train.learn.training import Training
-from train.runs.folders import locked
-from train.workers.places import Place
+from train.runs.folders import lock_run
+from train.workers.executors import Executors
 
 ROOT = Path(__file__).parents[1]
 SINE = {"kind": "sine", "duration_s": 1.0, "onset_s": 0.5, "amplitude": 0.1}
@@ -497,8 +497,10 @@ def test_several_configurations_are_trained_in_one_pool(
 ) -> None:
     """Catches configurations that wait for one another, a seed in the folder of another, a resume of one alone."""
     monkeypatch.chdir(tmp_path)
-    pools, opened = list[int](), Place.opened
-    monkeypatch.setattr(Place, "opened", lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder))
+    pools, opened = list[int](), Executors.open
+    monkeypatch.setattr(
+        Executors, "open", lambda self, calls, folder: pools.append(calls) or opened(self, calls, folder)
+    )
     configs = {name: {"name": name, **SMALL, **PPO, "base": base} for name, base in (("a", "input"), ("b", "dynamic"))}
     for name, config in configs.items():
         Path(f"{name}.yaml").write_text(yaml.safe_dump(config))
@@ -525,7 +527,7 @@ def test_a_training_seed_that_another_program_trains_is_left_alone(
     (tmp_path / "run" / "seed_3").mkdir(parents=True)
     (tmp_path / "run" / "config.yaml").write_text(Path("c.yaml").read_text())
     with (
-        locked(tmp_path / "run" / "seed_3"),
+        lock_run(tmp_path / "run" / "seed_3"),
         pytest.raises(ConfigurationError, match=rf"process {os.getpid()} of .* works on .*run/seed_3"),
     ):
         resume([tmp_path / "run"], Console(quiet=True))

@@ -21,9 +21,9 @@ import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ConfigurationError, SystemFailedError
 from elastic_env.rendering.side_by_side import COPIES, LINK, MOTOR, REFERENCE, SideBySide, enlarged_pose
 from tests.three_joints import ARM
+from train.commands.view import Page, Playback, record, show
+from train.commands.view_proxy import Access, Head, RefusedError, listen
 from train.evaluate.conditions import Condition, PolicySpec
-from train.experiments.view import Page, Playback, record, show
-from train.experiments.view_proxy import Access, Head, RefusedError, listen
 
 
 @pytest.fixture(scope="module")

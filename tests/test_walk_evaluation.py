@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from PIL import Image
 from rich.console import Console
 
-import train.experiments.compare
+import train.commands.compare
 from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.config import load_yaml
@@ -23,11 +23,11 @@ from elastic_env.dynamics.leg_kinematics import rotation_x, rotation_y
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.runtime.robot_model import WalkerModel
 from train.commands.cli import main
+from train.commands.compare import CompareConfig, try_out
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate
 from train.evaluate.rollout import make_vector_env
 from train.evaluate.support_changes import SupportChanges, com_jump, frame_error, support_changes, tilt
-from train.experiments.compare import CompareConfig, try_out
 from train.figures.chart import intervals, sweep_chart
 from train.figures.colours import policy_colours
 from train.figures.comparison_figures import by_option, by_reference, draw_pelvis, draw_sweep, draw_zmp, figure_name
@@ -42,7 +42,7 @@ CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 TRAININGS = [path for path in CONFIGS if path.stem.startswith("train_")]
 COMPARISONS = [path for path in CONFIGS if path not in TRAININGS and path.stem != "bench"]
 HIP_ROLL = 1
-"""Place of the hip roll joint in a leg of six."""
+"""Executors of the hip roll joint in a leg of six."""
 
 
 def walk(policy: str = "zero", reference: Any = None, **values: Any) -> Condition:
@@ -72,7 +72,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(conditions: Sequence[Condition], console: Console, *_: object) -> list[Evaluation]:
         return [evaluate(condition, num_threads=1) for condition in conditions]
 
-    monkeypatch.setattr(train.experiments.compare, "run_conditions", run)
+    monkeypatch.setattr(train.commands.compare, "run_conditions", run)
 
 
 @pytest.fixture(scope="module")

@@ -20,10 +20,10 @@ import PIL.Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 
 from elastic_env.rendering.picture import Image, with_text  # noqa: E402
+from train.commands.play import episode  # noqa: E402
+from train.commands.robot import Robot, robot_arguments  # noqa: E402
 from train.evaluate.conditions import Condition, PolicySpec  # noqa: E402
 from train.evaluate.rollout import make_policy  # noqa: E402
-from train.experiments.play import episode  # noqa: E402
-from train.experiments.robot import RobotTrial, robot_arguments  # noqa: E402
 
 _FRAMES_PER_S = 12.5
 _QUALITY = 40
@@ -51,7 +51,7 @@ class Film:
 
 def films() -> dict[str, Film]:
     """The films by the names of their files."""
-    robot = robot_arguments(RobotTrial(model="panda"))
+    robot = robot_arguments(Robot(model="panda"))
     circle = {"kind": "circle", "radius": 0.12, "duration_s": 5.0}
     return {
         "walk": Film(

@@ -13,9 +13,9 @@ import gymnasium
 from rich.console import Console
 
 from docs.pages.step_picture import CHARTS, WITH, WITHOUT
+from train.commands.play import episode
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.rollout import make_policy
-from train.experiments.play import episode
 from train.runs.escaping import write_records
 
 BEGIN_S = 4.0

@@ -29,8 +29,8 @@ from docs.pages.learned import (
 )
 from docs.pages.step_picture import step_svg
 from elastic_env.core.errors import ConfigurationError
+from train.commands.demo import PAPER_PELVIS
 from train.evaluate.standings import Standing
-from train.experiments.demo import PAPER_PELVIS
 from train.report.leaderboard import claims_markdown, leaderboard_markdown, read_leaderboard
 from train.report.render import Head, Row, Table, render
 

@@ -1,11 +1,13 @@
-"""What is wrong with the parameters of a model, in sentences that name each as its user wrote it."""
+"""Sentences about wrong parameters of a model, which name each as its user wrote it."""
 
 import itertools
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from elastic_env.core.errors import ConfigurationError, choices_listed, readable, shown
 
@@ -47,7 +49,8 @@ class Problem:
         return f"{owner or 'the configuration'} needs the parameter {own}{self.text}"
 
 
-_MOST_SAID, _LONGEST_SAID = 20, 1900
+_MOST_SAID = 20
+_LONGEST_SAID = 1900
 """Problems and characters, after which an error says how many more problems there are."""
 
 
@@ -66,7 +69,8 @@ class ModelError(ConfigurationError):
 
     def __init__(self, model: str, problems: Sequence[Problem]) -> None:
         super().__init__(model, problems)
-        self.model, self.problems = model, tuple(problems)
+        self.model = model
+        self.problems = tuple(problems)
 
     def __str__(self) -> str:
         """All problems, one per line, in the words of who made the model in Python."""
@@ -112,27 +116,35 @@ def _problem(model: type[BaseModel], path: ParameterPath, problem: Mapping[str, 
             return Problem(path, "missing", f"{_unit(model, path)}{meaning}")
         case "value_error":
             return Problem(path, "rule", str(problem["ctx"]["error"]))
-        case "model_type":
-            return Problem(path, "must", f"must be a mapping of parameters, got {given}")
-        case "too_short" | "too_long" as kind:
-            bound, key = ("least", "min_length") if kind == "too_short" else ("most", "max_length")
-            number = problem["ctx"][key]
-            entries = "entry" if number == 1 else "entries"
-            return Problem(path, "must", f"must have at {bound} {number} {entries}, got {given}")
-        case "string_too_long":
-            return Problem(path, "must", f"must have at most {problem['ctx']['max_length']} characters, got {given}")
         case "string_pattern_mismatch":
             meaning = model.model_fields[str(path[0])].description
             return Problem(path, "must", f"must be as follows: {meaning} Got {given}")
-    requirement = _bounds(model, path) or _KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be "))
-    return Problem(path, "must", f"must be {requirement}{_unit(model, path)}, got {given}{_meaning(model, path)}")
+    context = problem.get("ctx", {})
+    if bounds := _bounds(model, path):
+        requirement = f"be {bounds}"
+    elif kind := _REQUIREMENTS.get(problem["type"]):
+        requirement = kind.format(entries="entry" if 1 in context.values() else "entries", **context)
+    else:
+        requirement = f"be {problem['msg'].removeprefix('Input should be ')}"
+    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
+    meaning = meaning_of(field) if field is not None else ""
+    in_brackets = f" ({meaning})" if meaning else ""
+    return Problem(path, "must", f"must {requirement}{_unit(model, path)}, got {given}{in_brackets}")
 
 
-_KINDS = {
-    "string_type": "text", "dict_type": "a mapping", "list_type": "a list", "tuple_type": "a list",
-    "bool_type": "true or false", "bool_parsing": "true or false",
-}  # fmt: skip
-"""What a parameter must be, where Pydantic's words are not those of a configuration."""
+_REQUIREMENTS = {
+    "model_type": "be a mapping of parameters",
+    "dict_type": "be a mapping",
+    "list_type": "be a list",
+    "tuple_type": "be a list",
+    "string_type": "be text",
+    "bool_type": "be true or false",
+    "bool_parsing": "be true or false",
+    "too_short": "have at least {min_length} {entries}",
+    "too_long": "have at most {max_length} {entries}",
+    "string_too_long": "have at most {max_length} characters",
+}
+"""Requirements in the words of a configuration, where Pydantic's are those of Python."""
 
 
 def _path(location: Sequence[str | int], values: Any, is_missing: bool) -> ParameterPath:
@@ -173,12 +185,14 @@ def _number(bound: float) -> str:
     return f"{bound:d}" if isinstance(bound, int) else f"{bound:.6g}"
 
 
-def _meaning(model: type[BaseModel], path: ParameterPath) -> str:
-    """What a parameter is, in brackets; empty where its description is more than one line."""
-    field = model.model_fields.get(str(path[0])) if len(path) == 1 else None
-    if field is None or not field.description or not isinstance(field.json_schema_extra, dict):
+def meaning_of(field: FieldInfo) -> str:
+    """The first sentence of a quantity's description, without its unit; empty for another field."""
+    if not field.description or not isinstance(field.json_schema_extra, dict):
         return ""
-    return f" ({field.description.rpartition(' [')[0]})"
+    sentence = re.split(r"\.(?: |$)", " ".join(field.description.split()), maxsplit=1)[0]
+    if sentence[1:2].islower():  # no symbol and no abbreviation
+        sentence = sentence[0].lower() + sentence[1:]
+    return sentence.removesuffix(f" [{field.json_schema_extra['unit']}]")
 
 
 def _unit(model: type[BaseModel], path: ParameterPath) -> str:

@@ -23,7 +23,7 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
         ConfigurationError: It is no plain file, is larger, or leads out of the folder.
     """
     if within is not None and leads_out(path, within):
-        raise ConfigurationError(f"{_named(path)} is a link out of its folder; copy the file there")
+        raise ConfigurationError(f"{_short_path(path)} is a link out of its folder; copy the file there")
     _require_plain(path, path.stat(), most_bytes)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -35,7 +35,7 @@ def read_bounded(path: Path, most_bytes: int, within: Path | None = None) -> byt
 
 
 def leads_out(path: Path, folder: Path) -> bool:
-    """Whether a path leads out of a folder, after all links of both."""
+    """True if a path leads out of a folder, after all links of both."""
     return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
@@ -43,16 +43,16 @@ def _require_plain(path: Path, found: os.stat_result, most_bytes: int) -> None:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(found.st_mode):
-        raise ConfigurationError(f"{_named(path)} must be a plain file, it is a pipe, a socket or a device")
+        raise ConfigurationError(f"{_short_path(path)} must be a plain file, it is a pipe, a socket or a device")
     if found.st_size > most_bytes:
         raise _too_large(path, most_bytes, str(found.st_size))
 
 
 def _too_large(path: Path, most_bytes: int, has: str) -> ConfigurationError:
-    return ConfigurationError(f"{_named(path)} must have at most {most_bytes} bytes, it has {has}")
+    return ConfigurationError(f"{_short_path(path)} must have at most {most_bytes} bytes, it has {has}")
 
 
-def _named(path: Path) -> str:
+def _short_path(path: Path) -> str:
     return shown(str(path))[1:-1]
 
 

@@ -11,7 +11,7 @@ LARGEST_JSON = 1_000_000
 
 
 def parse_json(text: str) -> Any:
-    """What a text in JSON holds.
+    """Content of a text in JSON.
 
     Raises:
         ValueError: It is not JSON, is longer or deeper than the limits, or holds a key twice, a number that is not

@@ -27,16 +27,11 @@ NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 """Characters that stand in no name and no file: zero bytes and halves of characters."""
 
 
-class _FastLoader(Composer, yaml.CSafeLoader):
-    """PyYAML's composer, in which limits can be set, above libyaml's parser, several times as fast as PyYAML's."""
+class _Loader(Composer, yaml.CSafeLoader):
+    """PyYAML's, with limits, without dates and tags, and with the numbers of YAML 1.2: 1e3 is one too.
 
-    def __init__(self, text: str) -> None:
-        yaml.CSafeLoader.__init__(self, text)
-        Composer.__init__(self)
-
-
-class _Loader(_FastLoader):
-    """PyYAML's, with limits, without dates and tags, and with the numbers of YAML 1.2: 1e3 is one too."""
+    PyYAML's composer, in which limits can be set, is above libyaml's parser, several times as fast as PyYAML's.
+    """
 
     # dates stay text: a list of the resolvers of its own
     yaml_implicit_resolvers = {
@@ -45,7 +40,8 @@ class _Loader(_FastLoader):
     }
 
     def __init__(self, text: str) -> None:
-        super().__init__(text)
+        yaml.CSafeLoader.__init__(self, text)
+        Composer.__init__(self)
         self._depth = 0
         self._sizes: dict[int, int] = {}  # values that a node stands for, by its id
 
@@ -87,7 +83,7 @@ for _kind in ("int", "float"):
 
 
 def parse_yaml(text: str) -> Any:
-    """What a text in YAML holds: mappings with text as keys, lists, text, numbers, truth values, and None.
+    """Content of a text in YAML: mappings with text as keys, lists, text, numbers, truth values, and None.
 
     Raises:
         yaml.YAMLError: It is not YAML, beyond the limits of this module, or holds tags, dates as objects, zero bytes,

@@ -30,7 +30,7 @@ from elastic_env.hardware.safety.supervised_bus import SupervisedBus
 from elastic_env.hardware.settings import SafetyLimits
 from elastic_env.robots.testbed.config import TestbedConfig
 from tests.hardware_trials.wave import PERIOD_S, goal
-from train.hardware import PATIENT_LIMITS
+from train.commands.options import PATIENT_LIMITS
 
 _USB_LATENCY = Faults(latency_s=1e-3)
 _TORQUE_OFF_S = 0.1

@@ -13,11 +13,11 @@ from train.cells.store import Store, UnfitCellError
 from train.evaluate.conditions import Condition
 from train.evaluate.episodes import MOST_WORLDS, Evaluation, evaluate, evaluate_together
 from train.evaluate.rollout import PolicyFailedError, can_share_worlds, num_steps, shared_settings
-from train.runs.failures import DEFECT, explained
+from train.runs.failures import DEFECT, explain
 from train.runs.progress import Show, plain_progress, show_progress
 from train.runs.warned import each_once, said_so_far
 from train.workers.calls import Outcome, Tally, Watch, run_calls
-from train.workers.places import HERE, Place
+from train.workers.executors import LOCAL_EXECUTORS, Executors
 
 _MOST_NAMED = 5
 """Cells that one line names."""
@@ -39,7 +39,7 @@ class CellsFailedError(ElasticError):
 def run_conditions(
     conditions: Sequence[Condition],
     console: Console,
-    place: Place = HERE,
+    place: Executors = LOCAL_EXECUTORS,
     store: Store | None = None,
     fresh: bool = False,
 ) -> list[Evaluation]:
@@ -100,7 +100,9 @@ def _load_kept(conditions: Sequence[Condition], store: Store, console: Console) 
 class _Playing:
     """Conditions that are being played, in batches that share worlds."""
 
-    def __init__(self, conditions: Sequence[Condition], console: Console, place: Place, store: Store | None) -> None:
+    def __init__(
+        self, conditions: Sequence[Condition], console: Console, place: Executors, store: Store | None
+    ) -> None:
         self._conditions = conditions
         self._console = console
         self._place = place
@@ -138,7 +140,7 @@ class _Playing:
         watch = Watch(self._report, self._end, moved=self._say_moved)
         with tempfile.TemporaryDirectory() as own:
             folder = Path(own) if self._store is None else self._store.folder.parent
-            with self._place.opened(len(self._batches), folder) as pool:
+            with self._place.open(len(self._batches), folder) as pool:
                 said = said_so_far()
                 given = [(self._of(batch), said) for batch in range(len(self._batches))]
                 run_calls(_evaluate_beside, given, pool, watch)
@@ -210,11 +212,8 @@ def _failure_text(condition: Condition, outcome: Outcome) -> tuple[str, int]:
     """Text and exit code of a failure; a defect's traceback goes to the terminal."""
     error = outcome.error
     assert error is not None
-    found = explained(error)
-    said, code = found or (
-        f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}",
-        DEFECT,
-    )
+    found = explain(error)
+    said, code = found or (f"this is a defect: {type(error).__name__}: {error}\n{outcome.trace}", DEFECT)
     return said if isinstance(error, PolicyFailedError) else f"{_name(condition)}: {said}", code
 
 

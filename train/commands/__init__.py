@@ -1,1 +1,1 @@
-"""The commands of `elastic`, a dataclass of options each; what they do is imported when they run."""
+"""The commands of `elastic`: a module each, with its options, its help and its work."""

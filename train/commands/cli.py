@@ -1,7 +1,12 @@
 """The command `elastic`, and what it does when something fails."""
 
+import ast
 import contextlib
+import dataclasses
+import functools
+import importlib
 import math
+import operator
 import os
 import signal
 import sys
@@ -16,41 +21,40 @@ from rich.text import Text
 
 import elastic_env
 from elastic_env.core.errors import shortened
-from train.commands.guarding import Bench, Speed
-from train.commands.hardware import Hardware
-from train.commands.learning import Export, Iterate, Train
-from train.commands.options import CONSOLE
-from train.commands.playing import Compare, Demo, Evaluate, Identify, Play, Robot, View
 from train.runs.console import PlainConsole, traceback_of, visible_warnings
-from train.runs.failures import DEFECT, EndedError, explained
+from train.runs.failures import DEFECT, EndedError, explain
 from train.runs.import_path import look_last_in
 from train.runs.progress import say_what_is_compiled
 
-Command = (
-    Annotated[Identify, tyro.conf.subcommand("identify")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Iterate, tyro.conf.subcommand("iterate")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Speed, tyro.conf.subcommand("speed")]
-    | Annotated[Play, tyro.conf.subcommand("play")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Robot, tyro.conf.subcommand("robot")]
-    | Annotated[Hardware, tyro.conf.subcommand("hardware")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
+COMMANDS = (
+    "identify",
+    "evaluate",
+    "compare",
+    "train",
+    "iterate",
+    "export",
+    "bench",
+    "speed",
+    "play",
+    "view",
+    "robot",
+    "hardware",
+    "demo",
 )
+"""Modules of this folder, each with a class of its name: options, and `run` with a console."""
+
+CONSOLE = PlainConsole()
+"""The console on which the commands say what they do."""
 
 
 def _with_notes(error: BaseException, said: str | None = None) -> str:
-    """What an error says, and what was noted on its way here."""
+    """Text of an error, with the notes that it got on its way."""
     return "; ".join([str(error) if said is None else said, *getattr(error, "__notes__", [])])
 
 
-def _told(error: Exception) -> int:
+def _print_failure(error: Exception) -> int:
     """Say what failed; the exit code."""
-    found = explained(error)
+    found = explain(error)
     if found is None:
         sys.stderr.write(traceback_of(error))
     said, code = found or (f"this is a defect of elastic-env, please report it: {type(error).__name__}", DEFECT)
@@ -87,24 +91,64 @@ def _ended_by(*numbers: int) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _command(arguments: list[str] | None) -> Any:
-    given = sys.argv[1:] if arguments is None else arguments
-    if given == ["--version"]:
+def parse(arguments: list[str]) -> Any:
+    """The command that arguments name, with its options.
+
+    Raises:
+        ConfigurationError: An option is not what it has to be.
+        SystemExit: Help was asked for, or an option does not exist.
+    """
+    if arguments == ["--version"]:
         print(f"elastic-env {elastic_env.__version__}")
         sys.exit()
-    short = [shortened(argument).replace("\n", " ") for argument in given]
-    if short != given:
-        _parsed(short)  # what is wrong with them is said without a flood
-    return _parsed(given)
+    short = [shortened(argument).replace("\n", " ") for argument in arguments]
+    if short != arguments:
+        _parse(short)  # what is wrong with them is said without a flood
+    return _parse(arguments)
 
 
-def _parsed(arguments: list[str]) -> Any:
+def _parse(arguments: list[str]) -> Any:
+    if not arguments or arguments[0] not in COMMANDS:
+        return _parse_overview(arguments)
+
+    from train.commands.options import name_options
+
+    name = arguments[0]
+    options = getattr(importlib.import_module(f"train.commands.{name}"), name.capitalize())
+
+    def command(given: Any) -> Any:
+        return given
+
+    command.__doc__ = options.__doc__
+    # without a name of its own, what is wrong with an option is an error of this program, and no box of tyro's
+    command.__annotations__["given"] = Annotated[options, tyro.conf.arg(name="")]
+    with name_options():
+        return tyro.cli(command, prog=f"elastic {name}", args=arguments[1:], config=_STYLE)
+
+
+_STYLE = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
+
+
+def _parse_overview(arguments: list[str]) -> Any:
+    """Print the help of all commands, or refuse a command that does not exist; the commands need not be loaded."""
+    kinds = [dataclasses.make_dataclass(name, [], namespace={"__doc__": _help_of(name)}) for name in COMMANDS]
+    named = zip(COMMANDS, kinds, strict=True)
+    members: Any = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in named]
     return tyro.cli(
-        Command, prog="elastic", args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+        functools.reduce(operator.or_, members),
+        prog="elastic",
+        args=arguments,
+        config=_STYLE,
         description="Elastic joints: simulate, identify, compensate, compare. `elastic COMMAND --help` explains each, "
         "`elastic --version` says which version this is.",
-    )  # fmt: skip
+    )
+
+
+def _help_of(name: str) -> str | None:
+    """The docstring of a command, from its source."""
+    source = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
+    classes = (node for node in source.body if isinstance(node, ast.ClassDef))
+    return next(ast.get_docstring(node) for node in classes if node.name == name.capitalize())
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -112,13 +156,13 @@ def main(arguments: list[str] | None = None) -> None:
     with _ended_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         try:
             look_last_in(Path.cwd())  # for --policy module:function
-            command = _command(arguments)
+            command = parse(sys.argv[1:] if arguments is None else arguments)
             with say_what_is_compiled(CONSOLE), visible_warnings():
-                command.run()
+                command.run(CONSOLE)
         except BrokenPipeError:
             raise  # nobody reads any more: not worth a word
         except Exception as error:
-            sys.exit(_told(error))
+            sys.exit(_print_failure(error))
         except KeyboardInterrupt as error:
             number = error.args[0] if isinstance(error, EndedError) else signal.SIGINT
             said = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"

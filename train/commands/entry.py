@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from train.runs.escaping import visible
-from train.runs.failures import SYSTEM_FAILED, WRONG_INPUT, explained, is_interrupt, is_unread
+from train.runs.failures import SYSTEM_FAILED, WRONG_INPUT, explain, is_interrupt, is_unread
 from train.runs.import_path import ShadowedError, look_last_in, safe_children
 
 _UNREAD = 128 + signal.SIGPIPE
@@ -63,7 +63,7 @@ def _end_without_output(error: OSError) -> None:
     """End where nobody reads any more, or the disk that the output goes to is full; that is said, if it can be."""
     is_closed = isinstance(error, BrokenPipeError)
     if not is_closed:
-        said, _ = explained(error) or (str(error), SYSTEM_FAILED)
+        said, _ = explain(error) or (str(error), SYSTEM_FAILED)
         with contextlib.suppress(OSError):
             sys.stderr.write(visible(f"error: {said}\n"))
             sys.stderr.flush()

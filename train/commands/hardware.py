@@ -1,18 +1,45 @@
 """`elastic hardware`: scan, check, run, emulate."""
 
+import contextlib
+import csv
+import json
 import sys
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TextIO
 
+import gymnasium
+import numpy as np
 import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
-from elastic_env.core.errors import ConfigurationError
-from train.commands.options import CONSOLE, OnHardware, motion
+import elastic_env  # noqa: F401  registers the environments
+from elastic_env.core.config import Model
+from elastic_env.core.errors import ConfigurationError, require_known, shown
+from elastic_env.hardware.buses.dynamixel_bus import DynamixelBus
+from elastic_env.hardware.buses.packets import RATES, require_ids
+from elastic_env.hardware.buses.servo_models import servo_models
+from elastic_env.hardware.emulator.faults import Faults
+from elastic_env.hardware.emulator.launch import EmulatorConfig, RunningEmulator
+from elastic_env.hardware.imu import AttitudeStream
+from elastic_env.hardware.safety.checks import Check as BusCheck
+from elastic_env.hardware.safety.checks import check_bus
+from elastic_env.hardware.settings import HardwareSettings
+from elastic_env.robots.testbed.environment import configure_testbed
+from train.commands.options import MotionOrDefault, OnHardware, reference_of
+from train.evaluate.conditions import PolicySpec
+from train.evaluate.environments import environment
+from train.evaluate.rollout import make_policy
+from train.runs.folders import run_folder
+
+_SHOWN_S = 1.0
+_LATEST_FAULT_S = 86_400.0
 
 
-@dataclass
-class Scan:
+class Scan(Model):
     """List the servos at a port, with model and firmware; nothing moves.
 
     Example: elastic hardware scan /dev/ttyUSB0
@@ -23,16 +50,27 @@ class Scan:
     baudrate: int | None = None
     """Bits per second; default: the usual rates, one after the other."""
 
-    def run(self) -> None:
-        """Scan."""
-        from train.hardware import scan
-
-        if not scan(self.port, self.baudrate, CONSOLE):
+    def run(self, console: Console) -> None:
+        """Scan; exit code 3 where no servo answers."""
+        if self.baudrate is not None:
+            HardwareSettings(port=self.port, baudrate=self.baudrate)  # checks it
+        table = Table("bit/s", "id", "model number", "model", "firmware", title=f"servos at {self.port}")
+        for rate in RATES if self.baudrate is None else (self.baudrate,):
+            with DynamixelBus(self.port, rate) as bus:
+                for servo in bus.scan():
+                    model = servo_models().get(servo.model_number)
+                    name = model.name if model is not None else "not known here"
+                    table.add_row(str(rate), str(servo.servo_id), str(servo.model_number), name, str(servo.firmware))
+        if not table.row_count:
+            console.print(
+                f"no servo answers at {self.port}; check power, wiring and baud rate, and whether it is the IMU's port",
+                soft_wrap=True,
+            )
             sys.exit(3)
+        console.print(table)
 
 
-@dataclass
-class Check:
+class Check(Model):
     """Look at port, servos and IMU before anything moves, and say what to do; exit code 3 if there is anything to do.
 
     Example: elastic hardware check /dev/ttyUSB0 --ids 1 --imu-port /dev/ttyACM0
@@ -40,7 +78,7 @@ class Check:
 
     port: Annotated[str, tyro.conf.Positional]
     """Port, such as /dev/ttyUSB0."""
-    ids: list[int] = field(default_factory=lambda: [1])
+    ids: list[int] = [1]
     """Ids of the servos."""
     baudrate: int = 3_000_000
     """Bits per second."""
@@ -49,16 +87,28 @@ class Check:
     imu_baudrate: int = 115_200
     """Bits per second of the IMU's port; an IMU on USB has none."""
 
-    def run(self) -> None:
-        """Check."""
-        from train.hardware import check
-
-        if not check(self.port, self.ids, self.baudrate, self.imu_port, self.imu_baudrate, CONSOLE):
+    def run(self, console: Console) -> None:
+        """Check; nothing moves, nothing is written."""
+        HardwareSettings(  # checks them
+            port=self.port, baudrate=self.baudrate, imu_port=self.imu_port, imu_baudrate=self.imu_baudrate
+        )
+        require_ids(self.ids)
+        with DynamixelBus(self.port, self.baudrate) as bus:
+            checks = check_bus(bus, self.ids)
+        if self.imu_port is not None:
+            with AttitudeStream(self.imu_port, self.imu_baudrate) as stream:
+                sample = stream.latest()
+            angles = ", ".join(f"{name} {getattr(sample, name):+.4f}" for name in ("roll", "pitch", "yaw"))
+            checks.append(BusCheck("IMU", f"{angles} rad"))
+        table = Table("", "", "what to do", title=f"check of {self.port}", show_header=True)
+        for one in checks:
+            table.add_row(one.what, one.value, escape(one.cure) or "fine", style="" if one.is_good else "bold yellow")
+        console.print(table)
+        if not all(one.is_good for one in checks):
             sys.exit(3)
 
 
-@dataclass
-class Run:
+class Run(Model):
     """Play one episode on the real testbed, show it as it goes, and keep every step.
 
     Example: elastic hardware run --port /dev/ttyUSB0 --imu-port /dev/ttyACM0 --policy input --reference sine
@@ -67,31 +117,107 @@ class Run:
 
     policy: str = "uncompensated"
     """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own."""
-    reference: str | None = None
-    """Motion, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
+    reference: MotionOrDefault = None
+    """MotionOrDefault, as in elastic evaluate: sine takes 17 s, the default, hold, five minutes."""
     output: Path | None = None
     """Folder for log.csv and metrics.json, new or empty; default runs/hardware, numbered if taken."""
-    on: OnHardware = field(default_factory=OnHardware)
+    on: OnHardware = OnHardware()
 
-    def run(self) -> None:
-        """Play."""
-        from train.evaluate.conditions import PolicySpec
-        from train.hardware import run
-
+    def run(self, console: Console) -> None:
+        """Play one episode, show it as it goes, and keep every step in log.csv, also of one that is cut short."""
         if not (arguments := self.on.arguments):
             raise ConfigurationError("--port is needed; see: elastic hardware scan PORT, elastic hardware emulate")
-        folder = run(arguments, motion("hardware", self.reference), PolicySpec(name=self.policy), CONSOLE, self.output)
-        CONSOLE.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True)
+        reference = reference_of("hardware", self.reference)
+        spec = PolicySpec(name=self.policy)
+        name = environment("hardware").id
+        env: Any = gymnasium.make(name, disable_env_checker=True, reference=reference, **arguments)
+        with contextlib.closing(env):
+            policy = make_policy(spec, env)
+            configuration = {"policy": spec.model_dump(mode="json"), "reference": reference, **arguments}
+            with run_folder("hardware", configuration, None, self.output) as folder:
+                metrics: dict[str, Any] = {}
+                with _open_log(folder / "log.csv", console) as log:
+                    for info in _episode(env, policy):
+                        log.write(info)
+                        metrics = info.get("episode_metrics", metrics)
+                (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+        console.print(f"Results in {folder}: log.csv (every step), metrics.json, config.yaml", soft_wrap=True)
 
 
-@dataclass
-class Emulate:
+def _episode(env: Any, policy: Any) -> Iterator[dict[str, Any]]:
+    """Play an episode; yields the info of every step."""
+    observation, _ = env.reset()
+    state = None
+    start = np.array(True)
+    truncated = False
+    while not truncated:
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        observation, _, _, truncated, info = env.step(action)
+        start = np.array(False)
+        yield info
+
+
+class _Log:
+    """The rows of log.csv, and a line on the console once a second, up to which all rows are on the disk."""
+
+    _SHOWN = (
+        ("t", "s", "time_s", 1.0, "7.1f"),
+        ("q_ref", "rad", "reference_angle", 1.0, "+8.4f"),
+        ("link", "rad", "link_angle", 1.0, "+8.4f"),
+        ("torque", "N·m", "joint_torque", 1.0, "+8.1f"),
+        ("jitter", "ms", "jitter", 1e3, "+8.2f"),
+        ("overruns", "", "overruns", 1, "9d"),
+        ("missed", "", "missed_replies", 1, "7d"),
+        ("limited", "", "limited", 1, "8d"),
+    )
+
+    def __init__(self, file: TextIO, console: Console) -> None:
+        self.num_rows = 0
+        self._file = file
+        self._console = console
+        self._writer: csv.DictWriter[str] | None = None
+        self._next_s = _SHOWN_S
+
+    def write(self, info: dict[str, Any]) -> None:
+        row = {key: value for key, value in info.items() if not isinstance(value, dict)}
+        if self._writer is None:
+            self._writer = csv.DictWriter(self._file, list(row))
+            self._writer.writeheader()
+            for heading in (0, 1):
+                self._print([f"{shown[heading]:>{len(format(0, shown[4]))}}" for shown in self._SHOWN])
+        self._writer.writerow(row)
+        self.num_rows += 1
+        if row["time_s"] >= self._next_s:
+            self._next_s += _SHOWN_S
+            self._file.flush()
+            self._print([format(row[key] * factor, spec) for _, _, key, factor, spec in self._SHOWN])
+
+    def _print(self, cells: list[str]) -> None:
+        self._console.print("".join(cells), soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def _open_log(path: Path, console: Console) -> Iterator[_Log]:
+    """A log that stays whatever ends the episode."""
+    with path.open("w", newline="") as file:
+        log = _Log(file, console)
+        try:
+            yield log
+        except BaseException:
+            if log.num_rows:
+                console.print(f"cut short; the {log.num_rows} steps until then are in {path}", soft_wrap=True)
+            else:
+                path.unlink()
+            raise
+
+
+class Emulate(Model):
     """Emulate servos and an IMU on pseudo-terminals until Ctrl-C, for trying everything without hardware.
 
     Behind them moves the simulated joint, in real time. Example, a bad cable: elastic hardware emulate --lost 0.01
     """
 
-    ids: list[int] = field(default_factory=lambda: [1])
+    ids: list[int] = [1]
     """Ids of the servos; the IMU is on the link of the first."""
     model_number: int = 54024
     """Type of the servos: 54024, 54025 or 2020."""
@@ -113,35 +239,62 @@ class Emulate:
     """Share of replies that end too early."""
     latency_ms: float = 1.0
     """Latency timer of the emulated USB adapter."""
-    fault: list[str] = field(default_factory=list)
-    """What breaks after a while: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf, imu_out_of_range,
+    fault: list[str] = []
+    """Faults that begin later: overload, hot, silent, unplugged, imu_silent, imu_nan, imu_inf, imu_out_of_range,
     imu_frozen."""
     fault_after_s: float = 20.0
     """When that happens, after the start [s]."""
     seed: int = 0
     """Seed of noise and faults."""
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         """Emulate."""
-        from elastic_env.hardware.emulator.faults import Faults
-        from elastic_env.hardware.emulator.launch import EmulatorConfig
-        from elastic_env.robots.testbed.environment import configure_testbed
-        from train.hardware import emulate, require_switches
-
-        require_switches(self.fault)
-        faults = Faults(
-            unheard=self.unheard, lost=self.lost, late=self.late, corrupted=self.corrupted, truncated=self.truncated,
-            latency_s=1e-3 * self.latency_ms,
-        )  # fmt: skip
+        switches = [name for name, field in Faults.model_fields.items() if field.annotation is bool]
+        require_known("fault", self.fault, switches)
+        shares = {name: getattr(self, name) for name in ("unheard", "lost", "late", "corrupted", "truncated")}
         config = EmulatorConfig(
-            ids=tuple(self.ids), model_number=self.model_number, baudrate=self.baudrate, faults=faults, seed=self.seed,
+            ids=tuple(self.ids),
+            model_number=self.model_number,
+            baudrate=self.baudrate,
+            faults=Faults(**shares, latency_s=1e-3 * self.latency_ms),
+            seed=self.seed,
             testbed=configure_testbed(scenario=self.scenario, stiffness=self.stiffness),
-        )  # fmt: skip
-        emulate(config, CONSOLE, dict.fromkeys(self.fault, True), self.fault_after_s)
+        )
+        emulate(config, console, dict.fromkeys(self.fault, True), self.fault_after_s)
 
 
-@dataclass
-class Hardware:
+def emulate(
+    config: EmulatorConfig, console: Console, later: Mapping[str, bool] | None = None, after_s: float = 0.0
+) -> None:
+    """Emulate until Ctrl-C.
+
+    Args:
+        config: What is emulated.
+        console: Where the ports are said.
+        later: Faults that come after a while, see `Faults`.
+        after_s: When [s].
+
+    Raises:
+        ConfigurationError: That is no time that somebody can wait for.
+    """
+    if not 0.0 <= after_s <= _LATEST_FAULT_S:
+        raise ConfigurationError(f"--fault-after-s must be from 0 to {_LATEST_FAULT_S:g} s, got {shown(after_s)}")
+    with RunningEmulator(config) as emulator, contextlib.suppress(KeyboardInterrupt):
+        console.print(f"servos {', '.join(map(str, config.ids))} at {emulator.port}", soft_wrap=True)
+        console.print(f"IMU at {emulator.imu_port}", soft_wrap=True)
+        console.print(
+            f"for example: elastic hardware check {emulator.port}, or\n"
+            f"elastic identify --port {emulator.port} --imu-port {emulator.imu_port} --yes --patient\nCtrl-C ends it.",
+            soft_wrap=True,
+        )
+        if later:
+            time.sleep(after_s)
+            emulator.faults(**later)
+            console.print(f"from now on: {', '.join(later)}", soft_wrap=True)
+        emulator.wait()
+
+
+class Hardware(Model):
     """The testbed on real hardware, or on an emulated bus: scan, check, run, emulate."""
 
     command: (
@@ -151,6 +304,6 @@ class Hardware:
         | Annotated[Emulate, tyro.conf.subcommand("emulate")]
     )
 
-    def run(self) -> None:
+    def run(self, console: Console) -> None:
         """Do what was asked for."""
-        self.command.run()
+        self.command.run(console)

@@ -1,27 +1,77 @@
-"""What the commands of `elastic` share: console, options of hardware, and how options are read."""
+"""Options that several commands of `elastic` share, and how the text of an option becomes a value."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import yaml
+from pydantic import BeforeValidator
+from tyro.constructors import PrimitiveConstructorSpec
 
+from elastic_env.core.config import Locator, Model, load_yaml
 from elastic_env.core.config_problems import ModelError, ParameterPath
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.yaml_text import parse_yaml
-from train.runs.console import PlainConsole
-
-CONSOLE = PlainConsole()
-"""Where the commands say what they do."""
+from elastic_env.hardware.settings import HardwareSettings
+from elastic_env.robots.testbed.model import Pendulum
+from train.evaluate.conditions import GivenReference
+from train.evaluate.environments import environment
 
 DEFAULT_SCENARIO = "nominal"
 """Scenario of a simulation where none is named."""
 
+_TEXT = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="STR",
+    instance_from_str=lambda words: words[0],
+    is_instance=lambda _: True,
+    str_from_instance=lambda value: [str(value)],
+)
 
-@dataclass
-class OnHardware:
+
+def _read_reference(text: Any) -> Any:
+    try:
+        value = parse_yaml(text) if isinstance(text, str) else text
+    except yaml.YAMLError:
+        raise ConfigurationError(
+            f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "
+            "'{step_period: 3, num_steps: 2}'"
+        ) from None
+    return value if isinstance(value, int | float | list | dict) else text
+
+
+def _read_stiffness(text: Any) -> Any:
+    try:
+        value = parse_yaml(text) if isinstance(text, str) else text
+    except yaml.YAMLError:
+        return text
+    return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
+
+
+Motion = Annotated[GivenReference, BeforeValidator(_read_reference), _TEXT]
+"""A reference: a name, a number, durations or a mapping, or one of these as text in YAML."""
+MotionOrDefault = Annotated[Any, BeforeValidator(_read_reference), _TEXT]
+"""The same, which the cell checks that is made of it; or None, for the environment's default."""
+Stiffness = Annotated[Any, BeforeValidator(_read_stiffness), _TEXT]
+"""A stiffness: a number, a list of numbers, one of these as text, or the path of a file."""
+StiffnessOrFile = Annotated[Locator | float | None, BeforeValidator(_read_stiffness), _TEXT]
+"""One stiffness, as a number or as text, or the path of a file."""
+
+
+_PATIENT_IMU_S = 0.2
+PATIENT_LIMITS = {"patience_cycles": 10, "hang_s": 0.09}
+"""The most patient limits there are, for emulators: a busy computer delays pseudo-terminals."""
+
+
+class Mounting(HardwareSettings):
+    """Content of the file of `--mounting`: wiring and mounting of the testbed, and the pendulum that hangs there."""
+
+    pendulum: Pendulum = Pendulum()
+
+
+class OnHardware(Model):
     """Options of commands that run on the simulated testbed, or with --port on a real one."""
 
     port: str | None = None
@@ -36,120 +86,77 @@ class OnHardware:
     """Bear ten missing replies in a row, 90 ms without a command and attitudes 0.2 s old: for emulators, whose
     pseudo-terminals stall where the computer is busy."""
 
-    @property
+    @cached_property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of the environment on hardware; empty for the simulation."""
-        if self == OnHardware():
-            return {}
-        from train.hardware import hardware_arguments
-
-        return hardware_arguments(self.port, self.imu_port, self.mounting, yes=self.yes, patient=self.patient)
-
-
-@dataclass
-class OfArm:
-    """Options of `elastic identify` for an arm of which there is a log of static poses."""
-
-    robot: Path | None = None
-    """Rigid model of an arm, MJCF or URDF, in place of the testbed."""
-    log: Path | None = None
-    """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an IMU or joint torques."""
-    joints: tuple[str, ...] = ()
-    """Names or patterns of the joints whose stiffness is sought; default all in the log. The others are rigid."""
-    end_effector: str | None = None
-    """Site or body whose position is measured or that carries the IMU; default the outermost body."""
-    payload: str | None = None
-    """Body or site that carries a payload of unknown mass, which is estimated too."""
-    frame: Literal["known", "offset", "pose"] = "offset"
-    """Frame of tracker or IMU: known, unknown by an offset, or in pose; for an IMU the last two mean its mounting."""
-    measured_by: Literal["link_encoders", "end_effector", "imu", "torques"] | None = None
-    """Measurement to use, where the log has several or there is no log."""
-    within: float = 0.03
-    """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this share."""
-    assume: float | None = None
-    """K [N·m/rad] to write for joints that the poses do not tell; default the largest that was identified."""
-    plan: int = 0
-    """Propose so many further poses, within limits and without contacts, that tell the stiffness best."""
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """Options for an arm; empty where none is given.
+        """Arguments of `elastic_env/HardwareTestbed-v0`; empty for the simulation.
 
         Raises:
-            ConfigurationError: The robot is missing.
+            ConfigurationError: There are options of hardware, but no port.
         """
-        if self == OfArm():
+        if self.port is None and self.mounting is None:
+            for name in ("imu_port", "yes", "patient"):
+                if getattr(self, name):
+                    option = "--" + name.replace("_", "-")
+                    raise ConfigurationError(f"{option} is for a real testbed: name its servo's port too, with --port")
             return {}
-        if self.robot is None:
-            raise ConfigurationError("--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)")
-        paths = {"robot": str(self.robot), "log": None if self.log is None else str(self.log)}
-        return {**vars(self), **paths}
+        options = {"port": self.port, "imu_port": self.imu_port, "confirm": False if self.yes else None}
+        given = {name: value for name, value in options.items() if value is not None}
+        chosen = Mounting(**given) if self.mounting is None else load_yaml(self.mounting, Mounting, given)
+        names = chosen.model_fields_set | options.keys() | {"limits"}
+        values = {name: getattr(chosen, name) for name in names}
+        if self.patient:
+            values["limits"] = chosen.limits.replace(**PATIENT_LIMITS)
+            values["imu_oldest_s"] = max(chosen.imu_oldest_s, _PATIENT_IMU_S)
+        return {name: value.model_dump() if isinstance(value, Model) else value for name, value in values.items()}
+
+    def environment(self, env: str) -> dict[str, Any]:
+        """The environment of a comparison: the named one, or a real testbed with its arguments.
+
+        Raises:
+            ConfigurationError: The named one is not there on hardware.
+        """
+        if not (arguments := self.arguments):
+            return {"env": env}
+        real = environment(env).on_hardware
+        if not real:
+            raise ConfigurationError(
+                f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or --port and --mounting"
+            )
+        return {"env": real, "env_options": arguments}
+
+    def scenario(self, named: str | None) -> str:
+        """The named scenario, or the default; on hardware, which has none, the word for it in tables.
+
+        Raises:
+            ConfigurationError: A scenario is named for hardware.
+        """
+        if not self.arguments:
+            return named or DEFAULT_SCENARIO
+        if named is not None:
+            raise ConfigurationError(
+                f"scenario {named!r} is of a simulation, hardware is what it is: leave --scenario out, or --port"
+            )
+        return "hardware"
 
 
-def place(env: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Where a comparison plays: the named environment, or with arguments of hardware a real testbed."""
-    if not arguments:
-        return {"env": env}
-    from train.evaluate.environments import environment
-
-    real = environment(env).on_hardware
-    if not real:
-        raise ConfigurationError(
-            f"there is no {env!r} on hardware, only the testbed: leave --env {env} out, or --port and --mounting"
-        )
-    return {"env": real, "env_options": arguments}
-
-
-def scenario_played(asked: str | None, arguments: dict[str, Any]) -> str:
-    """The scenario that was asked for, or the default; on hardware, which has none, what stands for it in tables."""
-    if not arguments:
-        return DEFAULT_SCENARIO if asked is None else asked
-    if asked is not None:
-        raise ConfigurationError(
-            f"scenario {asked!r} is of a simulation, hardware is what it is: leave --scenario out, or --port"
-        )
-    return "hardware"
-
-
-@contextmanager
-def options_named() -> Iterator[None]:
-    """Errors of a configuration that is made from options name the options in place of its parameters."""
-    try:
-        yield
-    except ModelError as error:
-        raise ConfigurationError(error.named(spelt=_option)) from None
+def reference_of(env: str, reference: Any) -> Any:
+    """The reference, or the environment's default for None."""
+    return environment(env).default_reference if reference is None else reference
 
 
 _OF_ONE = {"references": "reference", "scenarios": "scenario", "policies": "policy"}
 """Options that give a list of a configuration its only entry."""
 
 
-def _option(path: ParameterPath) -> str:
+def option_name(path: ParameterPath) -> str:
     """A parameter as the option that sets it."""
     return "--" + _OF_ONE.get(str(path[0]), str(path[0])).replace("_", "-") if path else ""
 
 
-def motion(env: str, text: str | None) -> Any:
-    """A reference as it is written: a name, a number, durations or a mapping; the environment's default for None."""
-    from train.evaluate.environments import environment
-
-    default = environment(env).default_reference
-    if text is None:
-        return default
+@contextmanager
+def name_options() -> Iterator[None]:
+    """Let errors of a configuration that is made from options name the options in place of its parameters."""
     try:
-        value = parse_yaml(text)
-    except yaml.YAMLError:
-        raise ConfigurationError(
-            f"{text!r} is no name, number, list or mapping such as '{{kind: sine, amplitude: 0.3}}' or "
-            "'{step_period: 3, num_steps: 2}'"
-        ) from None
-    return value if isinstance(value, int | float | list | dict) else text
-
-
-def stiffness_option(text: str) -> float | list[Any] | str:
-    """A stiffness as it is written: a number, a list of numbers, or else the path of a file."""
-    try:
-        value = parse_yaml(text)
-    except yaml.YAMLError:
-        return text
-    return value if isinstance(value, int | float | list) and not isinstance(value, bool) else text
+        yield
+    except ModelError as error:
+        raise ConfigurationError(error.named(spelt=option_name)) from None

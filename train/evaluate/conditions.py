@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, field_validator
 from baselines.catalogue import Track
 from baselines.policies import sensors_needed, track
 from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
+from elastic_env.core.config_problems import meaning_of
 from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.runtime.scenario import MOST_RANGES, Scenario, make_scenario
@@ -234,5 +235,5 @@ def _numbers_of(model: type[Model], before: str) -> dict[str, tuple[str, str]]:
             found |= _numbers_of(field.annotation, f"{before}{name}.")
         elif isinstance(extra, dict):
             unit = str(extra["unit"])
-            found[f"{before}{name}"] = (field.description or name).removesuffix(f" [{unit}]"), unit
+            found[f"{before}{name}"] = meaning_of(field) or name, unit
     return found

@@ -27,7 +27,8 @@ _OURS = {
 """Arguments of the algorithms that are no options, and what stands in their place."""
 
 _LARGEST_WEIGHT = 1e3
-_WIDEST, _MOST_LAYERS = 4096, 16
+_WIDEST = 4096
+_MOST_LAYERS = 16
 
 
 def _network(*parts: str) -> Any:
@@ -68,8 +69,10 @@ def _entropy_weight(given: Any) -> Any:
 class _Options(Model):
     """Options that every algorithm has."""
 
-    learning_rate: float = quantity("1", 5e-4, gt=0, le=1, description="step of the optimiser")
-    gamma: float = quantity("1", 0.95, ge=0, le=1, description="discount of the reward per decision")
+    learning_rate: float = quantity("1", 5e-4, gt=0, le=1)
+    """Step of the optimiser."""
+    gamma: float = quantity("1", 0.95, ge=0, le=1)
+    """Discount of the reward per decision."""
 
     @model_validator(mode="before")
     @classmethod
@@ -84,9 +87,8 @@ class _NetworkOptions(Model):
     """Parameters of a network, `policy_kwargs`."""
 
     activation_fn: Literal["Tanh", "ReLU"] = "Tanh"
-    log_std_init: float = quantity(
-        "1", -1.0, ge=-20, le=2, description="logarithm of the first standard deviation of the residual, which is in ±1"
-    )
+    log_std_init: float = quantity("1", -1.0, ge=-20, le=2)
+    """Logarithm of the first standard deviation of the residual, which is in ±1."""
     use_expln: bool = False
     share_features_extractor: bool = False
     optimizer_kwargs: dict[str, Any] = {}
@@ -107,62 +109,87 @@ class _SACNetwork(_NetworkOptions):
 
     net_arch: _network("pi", "qf") = {"pi": [64, 64], "qf": [256, 256]}  # pyright: ignore[reportInvalidTypeForm]
     """Widths of the hidden layers of both networks, or of actor (pi) and critics (qf)."""
-    clip_mean: float = quantity("1", 2.0, ge=0, le=100, description="bound of the mean before tanh")
-    n_critics: int = quantity("1", 2, ge=1, le=16, description="critics")
+    clip_mean: float = quantity("1", 2.0, ge=0, le=100)
+    """Bound of the mean before tanh."""
+    n_critics: int = quantity("1", 2, ge=1, le=16)
+    """Critics."""
 
 
 class _StableBaselines(_Options):
     """Options of the classes of stable_baselines3."""
 
-    stats_window_size: int = quantity("1", 100, ge=1, le=10**6, description="episodes in a mean of TensorBoard's")
+    stats_window_size: int = quantity("1", 100, ge=1, le=10**6)
+    """Episodes in a mean of TensorBoard's."""
 
 
 class _OnPolicy(_StableBaselines):
     """Options of PPO and A2C."""
 
-    n_steps: int = quantity("1", 32, ge=1, le=100_000, description="decisions of every world between updates")
-    gae_lambda: float = quantity("1", 0.95, ge=0, le=1, description="weight of later advantages")
-    ent_coef: float = quantity("1", 0.0, ge=0, le=_LARGEST_WEIGHT, description="weight of the entropy in the loss")
-    vf_coef: float = quantity("1", 0.5, ge=0, le=_LARGEST_WEIGHT, description="weight of the value in the loss")
-    max_grad_norm: float = quantity("1", 0.5, gt=0, le=1e6, description="bound of the gradient's norm")
+    n_steps: int = quantity("1", 32, ge=1, le=100_000)
+    """Decisions of every world between updates."""
+    gae_lambda: float = quantity("1", 0.95, ge=0, le=1)
+    """Weight of later advantages."""
+    ent_coef: float = quantity("1", 0.0, ge=0, le=_LARGEST_WEIGHT)
+    """Weight of the entropy in the loss."""
+    vf_coef: float = quantity("1", 0.5, ge=0, le=_LARGEST_WEIGHT)
+    """Weight of the value in the loss."""
+    max_grad_norm: float = quantity("1", 0.5, gt=0, le=1e6)
+    """Bound of the gradient's norm."""
     normalize_advantage: bool = True
     use_sde: bool = False
-    sde_sample_freq: int = quantity("1", -1, ge=-1, le=10**6, description="decisions between draws of the noise")
+    sde_sample_freq: int = quantity("1", -1, ge=-1, le=10**6)
+    """Decisions between draws of the noise."""
     policy_kwargs: _ActorCriticNetwork | None = None
 
 
 class _PPO(_OnPolicy):
-    batch_size: int = quantity("1", 512, ge=2, le=10**7, description="decisions in a minibatch")
-    n_epochs: int = quantity("1", 10, ge=1, le=1000, description="passes over the decisions in an update")
-    clip_range: float = quantity("1", 0.2, gt=0, le=10, description="bound of the policy's ratio, about 1")
-    clip_range_vf: float | None = quantity("1", None, gt=0, le=1e6, description="bound of a value's change")
-    target_kl: float | None = quantity("1", None, gt=0, le=1e3, description="divergence that ends an update")
+    batch_size: int = quantity("1", 512, ge=2, le=10**7)
+    """Decisions in a minibatch."""
+    n_epochs: int = quantity("1", 10, ge=1, le=1000)
+    """Passes over the decisions in an update."""
+    clip_range: float = quantity("1", 0.2, gt=0, le=10)
+    """Bound of the policy's ratio, about 1."""
+    clip_range_vf: float | None = quantity("1", None, gt=0, le=1e6)
+    """Bound of a value's change."""
+    target_kl: float | None = quantity("1", None, gt=0, le=1e3)
+    """Divergence that ends an update."""
 
 
 class _A2C(_OnPolicy):
-    rms_prop_eps: float = quantity("1", 1e-5, ge=1e-12, le=1, description="smallest divisor of the optimiser")
+    rms_prop_eps: float = quantity("1", 1e-5, ge=1e-12, le=1)
+    """Smallest divisor of the optimiser."""
     use_rms_prop: bool = True
 
 
 class _SAC(_StableBaselines):
     ent_coef: Annotated[Any, AfterValidator(_entropy_weight)] = "auto"
     """Weight of the entropy, at most 1000; auto to learn it, auto_0.1 to begin at 0.1."""
-    batch_size: int = quantity("1", 512, ge=1, le=10**7, description="decisions in a minibatch")
-    buffer_size: int = quantity("1", 200_000, ge=1, le=10**7, description="decisions that are kept")
-    learning_starts: int = quantity("1", 2_000, ge=0, le=10**9, description="decisions before the first update")
-    train_freq: int = quantity("1", 4, ge=1, le=10**6, description="decisions of every world between updates")
-    gradient_steps: int = quantity("1", 8, ge=-1, le=10_000, description="steps of an update, -1: as decisions")
-    tau: float = quantity("1", 0.005, ge=0, le=1, description="share of the critic that its target takes on")
-    target_update_interval: int = quantity("1", 1, ge=1, le=10**6, description="steps between changes of the target")
+    batch_size: int = quantity("1", 512, ge=1, le=10**7)
+    """Decisions in a minibatch."""
+    buffer_size: int = quantity("1", 200_000, ge=1, le=10**7)
+    """Decisions that are kept."""
+    learning_starts: int = quantity("1", 2_000, ge=0, le=10**9)
+    """Decisions before the first update."""
+    train_freq: int = quantity("1", 4, ge=1, le=10**6)
+    """Decisions of every world between updates."""
+    gradient_steps: int = quantity("1", 8, ge=-1, le=10_000)
+    """Steps of an update, -1: as decisions."""
+    tau: float = quantity("1", 0.005, ge=0, le=1)
+    """Share of the critic that its target takes on."""
+    target_update_interval: int = quantity("1", 1, ge=1, le=10**6)
+    """Steps between changes of the target."""
     target_entropy: Literal["auto"] | Annotated[float, Field(ge=-1e6, le=1e6)] = "auto"
     """Entropy at which a learned weight aims."""
-    n_steps: int = quantity("1", 1, ge=1, le=1000, description="decisions of a return")
+    n_steps: int = quantity("1", 1, ge=1, le=1000)
+    """Decisions of a return."""
     policy_kwargs: _SACNetwork | None = None
 
 
 class _CMAES(Model):
-    population_size: int = quantity("1", 16, ge=2, le=100_000, description="candidates of a generation")
-    sigma: float = quantity("1", 0.3, gt=0, le=2, description="first standard deviation of the residual in ±1")
+    population_size: int = quantity("1", 16, ge=2, le=100_000)
+    """Candidates of a generation."""
+    sigma: float = quantity("1", 0.3, gt=0, le=2)
+    """First standard deviation of the residual in ±1."""
 
 
 class _OnesOwn(_Options, extra="allow"):

@@ -29,8 +29,15 @@ def algorithm_class(name: str) -> Any:
 
 
 _BAD_OPTIONS = (
-    TypeError, ValueError, AssertionError, AttributeError, ArithmeticError, LookupError, MemoryError, RuntimeError,
-)  # fmt: skip
+    TypeError,
+    ValueError,
+    AssertionError,
+    AttributeError,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+)
 """What algorithms raise for options that they cannot take, such as arrays beyond the memory."""
 
 

@@ -19,12 +19,13 @@ _DIGESTS = "sha256.json"
 
 
 @contextmanager
-def written(checkpoint: Path) -> Iterator[Path]:
+def write_checkpoint(checkpoint: Path) -> Iterator[Path]:
     """A fresh folder to write files to, which takes the checkpoint's place when all of them are on the disk.
 
-    A kill between its steps loses nothing, once `recovered` has been called; a failure leaves the old checkpoint.
+    A kill between its steps loses nothing, once `recover_checkpoint` was called; a failure leaves the old one.
     """
-    fresh, old = _beside(checkpoint, "new"), _beside(checkpoint, "old")
+    fresh = _beside(checkpoint, "new")
+    old = _beside(checkpoint, "old")
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     yield fresh
@@ -41,8 +42,8 @@ def written(checkpoint: Path) -> Iterator[Path]:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def recovered(checkpoint: Path) -> bool:
-    """Whether there is a checkpoint, after a kill between the moves of `written` as well."""
+def recover_checkpoint(checkpoint: Path) -> bool:
+    """True if there is a checkpoint, after a kill between the moves of `write_checkpoint` as well."""
     old = _beside(checkpoint, "old")
     if not checkpoint.exists() and old.exists():
         old.rename(checkpoint)
@@ -59,19 +60,19 @@ def require_whole(checkpoint: Path) -> None:
         digests = json.loads(read_bounded(checkpoint / _DIGESTS, LARGEST_JSON))
         found = {file.name: _digest(file) for file in checkpoint.iterdir() if file.name != _DIGESTS}
     except (OSError, ValueError, RecursionError) as error:
-        raise damaged(checkpoint, f"{_DIGESTS}: {error}") from None
+        raise damage_error(checkpoint, f"{_DIGESTS}: {error}") from None
     if not isinstance(digests, dict):
-        raise damaged(checkpoint, f"{_DIGESTS} is no table of files")
+        raise damage_error(checkpoint, f"{_DIGESTS} is no table of files")
     for name in sorted(digests.keys() | found.keys()):
         if name not in found:
-            raise damaged(checkpoint, f"{name} is missing")
+            raise damage_error(checkpoint, f"{name} is missing")
         if name not in digests:
-            raise damaged(checkpoint, f"{name} is not of it")
+            raise damage_error(checkpoint, f"{name} is not of it")
         if digests[name] != found[name]:
-            raise damaged(checkpoint, f"the content of {name} is not what was written")
+            raise damage_error(checkpoint, f"the content of {name} is not what was written")
 
 
-def damaged(checkpoint: Path, why: object) -> ElasticError:
+def damage_error(checkpoint: Path, why: object) -> ElasticError:
     """The error of a checkpoint that cannot be gone on with."""
     return ElasticError(
         f"the checkpoint {shortened(checkpoint)} is damaged or not whole ({why}); remove it to begin this seed anew"

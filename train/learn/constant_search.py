@@ -51,15 +51,19 @@ class ConstantSearch(Trainer):
                 f"CMA-ES needs a world for each of {self._population} candidates in each scenario, {needed}, "
                 f"got worlds: {config.worlds}"
             )
-        self._episodes, self._first = episodes, FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
+        self._episodes = episodes
+        self._first = FIRST_TRAINING_SEED + TRAINING_SEED_STRIDE * seed
         shares = [(scenario, episodes * self._population) for scenario in config.scenarios]
         self._worlds = training_worlds(config, shares, threads)
         (num_constants,) = self._worlds.single_action_space.shape or (0,)
         bounds = np.tile([-1.0, 1.0], (num_constants, 1))
         self._optimiser = CMA(
-            mean=np.zeros(num_constants), sigma=options["sigma"], bounds=bounds, seed=seed,
+            mean=np.zeros(num_constants),
+            sigma=options["sigma"],
+            bounds=bounds,
+            seed=seed,
             population_size=self._population,
-        )  # fmt: skip
+        )
         self._told: list[list[float]] = []
         self._done = 0
         folder.mkdir(parents=True, exist_ok=True)
@@ -75,7 +79,7 @@ class ConstantSearch(Trainer):
         self._tell(candidates, self._play(candidates))
 
     def _write(self, checkpoint: Path) -> None:
-        """What the search was told: from its seed and that, its state follows."""
+        """Write the costs that the search was told: from its seed and these, its state follows."""
         best = float(self._scores.best) if np.isfinite(self._scores.best) else None
         told = {"decisions": self.done, "best": best, "told": self._told}
         (checkpoint / _TOLD).write_text(json.dumps(told), encoding="utf-8")
@@ -97,13 +101,15 @@ class ConstantSearch(Trainer):
 
     def _play(self, candidates: Array) -> Array:
         """Cost of each candidate: minus its mean sum of rewards over an episode, and falls, (population,)."""
-        n, scenarios = self._worlds.num_envs, len(self.config.scenarios)
+        n = self._worlds.num_envs
+        scenarios = len(self.config.scenarios)
         generation = len(self._told)
         own = self._first + generation * self._episodes + np.arange(self._episodes)
         self._worlds.reset(seed=np.tile(own, n // self._episodes).tolist())
         # worlds in the order scenario, candidate, episode
         residuals = np.tile(np.repeat(candidates, self._episodes, axis=0), (scenarios, 1))
-        total, alive = np.zeros(n), np.ones(n, dtype=np.bool_)
+        total = np.zeros(n)
+        alive = np.ones(n, dtype=np.bool_)
         while alive.any():
             _, reward, terminated, truncated, _ = self._worlds.step(residuals)
             require_finite("the reward", np.where(alive, reward, 0.0))

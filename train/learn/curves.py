@@ -25,7 +25,8 @@ class Curves(Logger):
 
     def __init__(self, folder: str, model: Any, worlds: SB3VecEnv) -> None:
         super().__init__(folder, [make_output_format("tensorboard", folder)])
-        self._model, self._worlds = model, worlds
+        self._model = model
+        self._worlds = worlds
 
     def dump(self, step: int = 0) -> None:
         """Write what was recorded; see SB3."""

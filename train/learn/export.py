@@ -31,9 +31,11 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
     """
     policy: Any = model.policy
     if hasattr(policy, "mlp_extractor") and hasattr(policy, "action_net"):
-        layers, output = [*policy.mlp_extractor.policy_net, policy.action_net], "clip"
+        layers = [*policy.mlp_extractor.policy_net, policy.action_net]
+        output = "clip"
     elif hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
-        layers, output = [*policy.actor.latent_pi, policy.actor.mu], "tanh"
+        layers = [*policy.actor.latent_pi, policy.actor.mu]
+        output = "tanh"
     else:
         raise ConfigurationError(f"a policy of {type(model).__name__} cannot be exported; use PPO, A2C, SAC or TQC")
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
@@ -56,7 +58,8 @@ def network_of(model: BaseAlgorithm, normaliser: Any | None) -> tuple[Tensors, s
 def _joints_that_fit(tensors: Tensors, config: TrainConfig) -> list[str]:
     """The joints of the configuration's robot, once the widths of a network are what its residual sees and does."""
     worlds = training_worlds(config, [(config.scenarios[0], 1)], 1)
-    sees, does = flatdim(worlds.single_observation_space), flatdim(worlds.single_action_space)
+    sees = flatdim(worlds.single_observation_space)
+    does = flatdim(worlds.single_action_space)
     joints = joints_of(worlds)
     worlds.close()
     last = max(int(name.removeprefix("bias")) for name in tensors if name.startswith("bias"))

@@ -78,7 +78,7 @@ class MixedVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     @property
     def assumed_model(self) -> RobotModel:
-        """What a compensator may know of the robot; the same in all environments."""
+        """The robot as a compensator may know it; the same in all environments."""
         model: RobotModel = self.envs[0].assumed_model
         return model
 

@@ -16,13 +16,14 @@ from train.evaluate.progress import read_progress
 from train.learn.algorithm_options import CONSTANTS
 from train.learn.train_config import TrainConfig
 from train.learn.trainer import Trainer
-from train.runs.folders import locked, locked_part, require_name, require_run, run_folder
+from train.runs.console import make_table
+from train.runs.folders import lock_part, lock_run, require_name, require_run, run_folder
 from train.runs.progress import Show, show_progress
 from train.runs.user_code import code_refused, require_no_code
 from train.workers.calls import Outcome, Tally, Watch, run_calls
-from train.workers.places import Place
+from train.workers.executors import Executors
 
-ONE_BY_ONE = Place(jobs=1)
+ONE_BY_ONE = Executors(jobs=1)
 """Seeds in turn, in this process, with all cores for the physics of each."""
 _PATIENCE_S = 60.0
 """How long the program that works on a training seed is waited for."""
@@ -41,7 +42,7 @@ class Run:
 
 
 def start(
-    configs: Sequence[TrainConfig], console: Console, output: Path | None = None, place: Place = ONE_BY_ONE
+    configs: Sequence[TrainConfig], console: Console, output: Path | None = None, executors: Executors = ONE_BY_ONE
 ) -> list[Path]:
     """Train all seeds of some configurations, each in a new run.
 
@@ -50,7 +51,7 @@ def start(
         console: Where progress and results go.
         output: Folder, new or empty; of several configurations each has a folder in it by its name. Default
             runs/<name>, numbered if taken.
-        place: Where seeds are trained, and how many at a time; the weights do not depend on it.
+        executors: Where seeds are trained, and how many at a time; the weights do not depend on it.
 
     Returns:
         The runs' folders; there is none where nothing could begin.
@@ -65,34 +66,34 @@ def start(
             own = output if output is None or len(configs) == 1 else output / require_name(config.name)
             made = run_folder(config.name, config.model_dump(mode="json"), config.seeds[0], own)
             runs.append(Run(config, held.enter_context(made)))
-            held.enter_context(locked(runs[-1].folder))
-        _train(runs, console, place)
+            held.enter_context(lock_run(runs[-1].folder))
+        _train(runs, console, executors)
     return [run.folder for run in runs]
 
 
 def resume(
-    folders: Sequence[Path], console: Console, place: Place = ONE_BY_ONE, trust_code: bool = False
+    folders: Sequence[Path], console: Console, executors: Executors = ONE_BY_ONE, trust_code: bool = False
 ) -> list[Path]:
     """Go on with runs that were interrupted or killed; seeds that are complete stay as they are.
 
     Args:
         folders: Of the runs.
         console: Where progress and results go.
-        place: Where seeds are trained, and how many at a time.
+        executors: Where seeds are trained, and how many at a time.
         trust_code: Whether an algorithm of one's own, "module:Class", may be imported: its code may lie in a folder.
 
     Raises:
         ConfigurationError: A folder is no training run, another program works on it, or its algorithm is not trusted.
     """
-    runs = [Run(_recorded(folder, trust_code), folder) for folder in folders]
+    runs = [Run(_recorded_config(folder, trust_code), folder) for folder in folders]
     with ExitStack() as held:
         for run in runs:
-            held.enter_context(locked(run.folder))
-        _train(runs, console, place)
+            held.enter_context(lock_run(run.folder))
+        _train(runs, console, executors)
     return [run.folder for run in runs]
 
 
-def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
+def _recorded_config(folder: Path, trust_code: bool) -> TrainConfig:
     """The configuration of a run that is gone on with."""
     file = require_run(folder, "training run", "train printed")
     if trust_code:
@@ -103,7 +104,7 @@ def _recorded(folder: Path, trust_code: bool) -> TrainConfig:
     return config
 
 
-def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
+def _train(runs: Sequence[Run], console: Console, executors: Executors) -> None:
     for run in runs:
         if run.lacks():
             console.print(f"training in {run.folder}; if it stops: elastic train --resume {run.folder}", soft_wrap=True)
@@ -113,11 +114,11 @@ def _train(runs: Sequence[Run], console: Console, place: Place) -> None:
     calls = [_Call(run, seed, len(runs) > 1) for run in runs for seed in run.config.seeds]
     totals = {call.name: call.run.config.decisions for call in calls}
     with show_progress(console, totals, unit="decisions") as show:
-        if place == ONE_BY_ONE:
+        if executors == ONE_BY_ONE:
             for number, call in enumerate(calls):
                 _train_seed(call.run.config, call.seed, call.run.folder, 0, partial(show, number))
         else:
-            _train_beside(calls, console, place, show)
+            _train_beside(calls, console, executors, show)
     for run in runs:
         console.print(_table(run.config, run.folder))
 
@@ -132,16 +133,17 @@ class _Call:
 
     @property
     def name(self) -> str:
-        """What progress calls it."""
+        """Name of the seed in the progress."""
         return f"{self.run.folder.name}, seed {self.seed}" if self.is_one_of_several else f"seed {self.seed}"
 
 
-def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: Show) -> None:
+def _train_beside(calls: Sequence[_Call], console: Console, executors: Executors, show: Show) -> None:
     """Train seeds beside each other: they share the cores among them.
 
     Ctrl-C ends at once, since a seed may take hours; each goes on from its checkpoint.
     """
-    done, note = [0] * len(calls), ""
+    done = [0] * len(calls)
+    note = ""
 
     def report(number: int, decisions: int) -> None:
         done[number] = max(done[number], decisions)
@@ -154,10 +156,10 @@ def _train_beside(calls: Sequence[_Call], console: Console, place: Place, show: 
     def moved(number: int) -> None:
         console.print(f"a worker was lost; {calls[number].name} goes on from its checkpoint", soft_wrap=True)
 
-    threads = place.threads_per_call(len(calls))
+    threads = executors.threads_per_call(len(calls))
     given = [(call.run.config, call.seed, call.run.folder.resolve(), threads) for call in calls]
     watch = Watch(reported=report, tallied=tallied, moved=moved)
-    with place.opened(len(given), calls[0].run.folder) as pool:
+    with executors.open(len(given), calls[0].run.folder) as pool:
         outcomes = run_calls(_train_seed, given, pool, watch, finishes=False)
     _raise_first(calls, outcomes)
 
@@ -177,7 +179,7 @@ def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, repo
     """
     own = folder / f"seed_{seed}"
     report(0)
-    with locked_part(own, _PATIENCE_S):
+    with lock_part(own, _PATIENCE_S):
         if not _is_complete(own):
             training = _trainer(config)(config, seed, own, threads)
             report(training.done)
@@ -186,7 +188,7 @@ def _train_seed(config: TrainConfig, seed: int, folder: Path, threads: int, repo
 
 
 def _is_complete(own: Path) -> bool:
-    """Whether a seed's training has come to its end."""
+    """True if a seed's training has come to its end."""
     return (own / "last").is_dir()
 
 
@@ -203,15 +205,14 @@ def _trainer(config: TrainConfig) -> type[Trainer]:
 def _table(config: TrainConfig, folder: Path) -> Table:
     """Scores of the last policies against their base, on the episodes of the evaluation on the way."""
     columns = environment(config.env).judged
-    table = Table(title=f"last policies on {config.base}, on episodes that training never sees")
-    for name in ("seed", "scenario", *(column.label for column in columns), "failed"):
-        table.add_column(name, justify="left" if name == "scenario" else "right")
+    head = ["seed", "scenario", *(column.label for column in columns), "failed"]
+    table = []
     for seed in config.seeds:
         rows = read_progress(folder / f"seed_{seed}", [column.metric for column in columns], ["failed"])
         for row in (row for row in rows if row["decisions"] == rows[-1]["decisions"]):
             scores = [_change(row[f"base_{column.metric}"], row[column.metric], column.scale) for column in columns]
-            table.add_row(str(seed), row["scenario"], *scores, f"{row['failed']:.0f}")
-    return table
+            table.append([str(seed), row["scenario"], *scores, f"{row['failed']:.0f}"])
+    return make_table(f"last policies on {config.base}, on episodes that training never sees", head, table, left=2)
 
 
 def _change(base: float, mine: float, scale: float) -> str:

@@ -38,9 +38,11 @@ class SB3VecEnv(VecEnv):
             raise ConfigurationError(
                 f"SB3 restarts worlds in the same step, autoreset_mode must be SameStep, got {mode}"
             )
-        self.env, self._stagger = env, stagger
+        self.env = env
+        self._stagger = stagger
         self._actions: Any = None
-        self._reward, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
+        self._reward = np.zeros(env.num_envs)
+        self._length = np.zeros(env.num_envs, dtype=np.int64)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Any:
@@ -51,7 +53,8 @@ class SB3VecEnv(VecEnv):
             self.env.stagger(self._stagger)  # type: ignore[attr-defined]
         self._reset_seeds()
         self._reset_options()
-        self._reward[:], self._length[:] = 0.0, 0
+        self._reward[:] = 0.0
+        self._length[:] = 0
         return observation
 
     def begin_with(self, seed: int, stagger: np.random.Generator) -> None:
@@ -79,7 +82,8 @@ class SB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
         if done.any():
             final = info["final_info"]
-            metrics, scored = final.get("episode_metrics", {}), final.get("_episode_metrics", done)
+            metrics = final.get("episode_metrics", {})
+            scored = final.get("_episode_metrics", done)
             for world in np.flatnonzero(done).tolist():
                 own = {name: values[world].item() for name, values in metrics.items() if scored[world]}
                 infos[world] = {
@@ -88,9 +92,11 @@ class SB3VecEnv(VecEnv):
                     "episode_metrics": own,
                 }
                 if own or self._stagger is None:
-                    reward_sum, length = float(self._reward[world]), int(self._length[world])
+                    reward_sum = float(self._reward[world])
+                    length = int(self._length[world])
                     infos[world]["episode"] = {"r": reward_sum, "l": length, "t": 0.0}
-            self._reward[done], self._length[done] = 0.0, 0
+            self._reward[done] = 0.0
+            self._length[done] = 0
         return observation, reward.astype(np.float32), done, infos
 
     @property

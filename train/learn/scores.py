@@ -37,7 +37,9 @@ class Scores:
     """
 
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
-        self._config, self._folder, self._threads = config, folder, threads
+        self._config = config
+        self._folder = folder
+        self._threads = threads
         self._provenance = provenance(seed)
         self._base_scores: list[_Scored] | None = None
         self.best = np.inf
@@ -56,9 +58,10 @@ class Scores:
         current = self.keep("current", decisions, policy)
         columns = [column.metric for column in environment(self._config.env).judged]
         if self._base_scores is None:
-            self._base_scores = self._played(self._config.base, columns)
-        scores = self._base_scores if decisions == 0 else self._played(f"residual:{current}", columns)
-        table, ratios = [], []
+            self._base_scores = self._play(self._config.base, columns)
+        scores = self._base_scores if decisions == 0 else self._play(f"residual:{current}", columns)
+        table = []
+        ratios = []
         for scenario, (mine, falls), (base, base_falls) in zip(
             self._config.scenarios, scores, self._base_scores, strict=True
         ):
@@ -98,7 +101,7 @@ class Scores:
             return
         write_whole(path, "".join([lines[0], *kept]))
 
-    def _played(self, policy: str, metrics: list[str]) -> list[_Scored]:
+    def _play(self, policy: str, metrics: list[str]) -> list[_Scored]:
         """For each scenario means of metrics over the episodes that did not fail, and how many did."""
         conditions = [self._config.condition(scenario, policy) for scenario in self._config.scenarios]
         results = played_together(conditions, metrics, self._threads)

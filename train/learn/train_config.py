@@ -1,4 +1,4 @@
-"""What is trained on what: the configuration of a training, and the worlds that it learns from."""
+"""Configuration of a training, and the worlds that it learns from."""
 
 from typing import Annotated, Any, Self
 
@@ -18,7 +18,8 @@ from train.learn.algorithm_options import checked_options
 from train.learn.mixed_env import mixed_env
 from train.runs.kinds import is_a
 
-FIRST_TRAINING_SEED, EVALUATION_SEED = 10_000_000, 50_000
+FIRST_TRAINING_SEED = 10_000_000
+EVALUATION_SEED = 50_000
 """Episodes of evaluation begin at the second, those of training at the first: no seed serves both."""
 TRAINING_SEED_STRIDE = 100_000
 """Distance of the episodes of two training seeds."""
@@ -28,7 +29,7 @@ _MOST_DECISIONS = 10**12
 
 
 class TrainConfig(Model):
-    """What is trained on what."""
+    """A training: worlds, base policy, algorithm, and how long."""
 
     name: Title = "train"
     env: str = "walker"
@@ -53,18 +54,21 @@ class TrainConfig(Model):
     algorithm_options: dict[str, Any] = {}
     """Its keyword arguments, over the defaults."""
     anneal: bool = False
-    """Whether the learning rate falls linearly to zero over the decisions."""
-    clip: float = quantity("1", 10.0, gt=0, le=1e6, description="bound of normalised features, in standard deviations")
-    worlds: int = quantity("1", 64, ge=2, le=10_000_000, description="worlds, shared out to the scenarios")
-    decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS, description="decisions of all worlds together")
+    """Let the learning rate fall linearly to zero over the decisions."""
+    clip: float = quantity("1", 10.0, gt=0, le=1e6)
+    """Bound of normalised features, in standard deviations."""
+    worlds: int = quantity("1", 64, ge=2, le=10_000_000)
+    """Worlds, shared out to the scenarios."""
+    decisions: int = quantity("1", 200_000, ge=1, le=_MOST_DECISIONS)
+    """Decisions of all worlds together."""
     seeds: list[Annotated[int, Field(ge=0, lt=2**32)]] = Field(default=[0], min_length=1, max_length=MOST_ENTRIES)
     """Training seeds, each a run of its own."""
-    evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS, description="decisions between evaluations")
-    evaluation_episodes: int = quantity(
-        "1", 4, ge=1, le=MOST_EPISODES, description="episodes per scenario in an evaluation"
-    )
-    checkpoint_every: int = quantity("1", 50_000, ge=1, le=_MOST_DECISIONS, description="decisions between checkpoints")
-    """A checkpoint ends all episodes: leave several of every world between two."""
+    evaluate_every: int = quantity("1", 20_000, ge=1, le=_MOST_DECISIONS)
+    """Decisions between evaluations."""
+    evaluation_episodes: int = quantity("1", 4, ge=1, le=MOST_EPISODES)
+    """Episodes per scenario in an evaluation."""
+    checkpoint_every: int = quantity("1", 50_000, ge=1, le=_MOST_DECISIONS)
+    """Decisions between checkpoints. A checkpoint ends all episodes: leave several of every world between two."""
 
     _kind = model_validator(mode="before")(is_a("training"))
     _checked = field_validator("base")(require_plain_base)
@@ -115,14 +119,19 @@ class TrainConfig(Model):
         )
 
     def description(self, joints: list[str], **network: Any) -> ResidualDescription:
-        """What an exported policy says of itself; `network` names its activation and output."""
+        """Description of an exported policy; `network` names its activation and output."""
         return ResidualDescription(
-            robot=environment(self.env).robot, joints=joints, base=self.base, base_options=self.base_options,
-            settings=self.settings, clip=self.clip, **network,
-        )  # fmt: skip
+            robot=environment(self.env).robot,
+            joints=joints,
+            base=self.base,
+            base_options=self.base_options,
+            settings=self.settings,
+            clip=self.clip,
+            **network,
+        )
 
     def is_due(self, every: int, before: int, now: int) -> bool:
-        """Whether something that is done every so many decisions, and at the end, is due between two counts of them."""
+        """True if work that is done every so many decisions, and at the end, is due between two counts."""
         return now // every > before // every or now >= self.decisions
 
     @property

@@ -1,4 +1,4 @@
-"""What all ways of learning have in common: the loop over decisions with evaluations and checkpoints on the way."""
+"""Base of all ways of learning: the loop over decisions with evaluations and checkpoints on the way."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -7,7 +7,7 @@ from typing import Any
 
 from baselines.residual.residual import ResidualDescription
 from elastic_env.core.errors import ElasticError, shortened
-from train.learn.checkpoint import damaged, recovered, require_whole, written
+from train.learn.checkpoint import damage_error, recover_checkpoint, require_whole, write_checkpoint
 from train.learn.finite import DivergedError
 from train.learn.scores import Scores
 from train.learn.train_config import TrainConfig
@@ -27,7 +27,8 @@ class Trainer(ABC):
     """
 
     def __init__(self, config: TrainConfig, seed: int, folder: Path, threads: int = 0) -> None:
-        self.config, self.folder = config, folder
+        self.config = config
+        self.folder = folder
         self._seed = seed
         self._scores = Scores(config, seed, folder, threads)
         self._kept: int | None = None
@@ -46,7 +47,7 @@ class Trainer(ABC):
             try:
                 self._advance()
             except DivergedError as error:
-                raise ElasticError(self._diverged(error.quantity)) from error
+                raise ElasticError(self._divergence_text(error.quantity)) from error
             if config.is_due(config.evaluate_every, before, self.done):
                 self._evaluate()
             if config.is_due(config.checkpoint_every, before, self.done):
@@ -62,7 +63,7 @@ class Trainer(ABC):
 
     def checkpoint(self) -> None:
         """Keep everything that the rest depends on."""
-        with written(self.folder / CHECKPOINT) as fresh:
+        with write_checkpoint(self.folder / CHECKPOINT) as fresh:
             self._write(fresh)
         self._kept = self.done
 
@@ -73,16 +74,16 @@ class Trainer(ABC):
             ElasticError: The checkpoint is not what was written.
         """
         path = self.folder / CHECKPOINT
-        if recovered(path):
+        if recover_checkpoint(path):
             require_whole(path)
             try:
                 self._read(path)
             except (KeyError, IndexError, TypeError, ValueError, RecursionError, RuntimeError) as error:
-                raise damaged(path, f"{type(error).__name__}: {error}") from error
+                raise damage_error(path, f"{type(error).__name__}: {error}") from error
             self._kept = self.done
         self._scores.forget_after(self.done)
 
-    def _diverged(self, quantity: str) -> str:
+    def _divergence_text(self, quantity: str) -> str:
         """The sentence for a quantity that is no longer finite."""
         kept = f"the checkpoint of decision {self._kept} is kept in {shortened(self.folder / CHECKPOINT)}"
         if self._kept is None:

@@ -31,16 +31,16 @@ from train.learn.state import read_state, write_state
 from train.learn.train_config import FIRST_TRAINING_SEED, TRAINING_SEED_STRIDE, TrainConfig, joints_of, training_worlds
 from train.learn.trainer import Trainer
 
+_COMMON = {"gamma": 0.95, "learning_rate": 5e-4, "batch_size": 512}
+_PPO = {"n_steps": 32, "n_epochs": 10, "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0}}
+_SAC_NETWORKS = {"net_arch": {"pi": [64, 64], "qf": [256, 256]}}
+_SAC = {"buffer_size": 200_000, "learning_starts": 2_000, "train_freq": 4, "gradient_steps": 8}
 _DEFAULTS: dict[str, dict[str, Any]] = {
-    "PPO": {
-        "n_steps": 32, "batch_size": 512, "n_epochs": 10, "gamma": 0.95, "learning_rate": 5e-4,
-        "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -1.0},
-    },
-    "SAC": {
-        "gamma": 0.95, "learning_rate": 5e-4, "batch_size": 512, "buffer_size": 200_000, "learning_starts": 2_000,
-        "train_freq": 4, "gradient_steps": 8, "policy_kwargs": {"net_arch": {"pi": [64, 64], "qf": [256, 256]}},
-    },
-}  # fmt: skip
+    "PPO": {**_COMMON, **_PPO},
+    "SAC": {**_COMMON, **_SAC, "policy_kwargs": _SAC_NETWORKS},
+}
+_OF_MODEL = ("num_timesteps", "_n_updates", "_episode_num")
+"""Attributes of an algorithm of SB3 that a training goes on from."""
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -65,7 +65,7 @@ class Training(Trainer):
         self._joints = joints_of(worlds)
         self._worlds = SB3VecEnv(worlds, np.random.default_rng(seed))
         self._seed = seed
-        options = _merged(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
+        options = _merge(_DEFAULTS.get(config.algorithm, {}), config.algorithm_options)
         gamma = options.get("gamma", 0.99)
         self._normaliser = VecNormalize(self._worlds, clip_obs=config.clip, norm_reward=True, gamma=gamma)
         set_random_seed(seed)
@@ -74,7 +74,9 @@ class Training(Trainer):
         with options_named(config.algorithm, config.algorithm_options), warnings.catch_warnings():
             # a rollout whose last minibatch is smaller is no mistake
             warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
-            self.model: Any = algorithm("MlpPolicy", self._normaliser, device="cpu", seed=None, **_resolved(options))
+            self.model: Any = algorithm(
+                "MlpPolicy", self._normaliser, device="cpu", seed=None, **_with_activation(options)
+            )
             self._learning_rate = float(self.model.lr_schedule(1.0))
             self._shrink_last_layer()
         self.model.action_space.seed(seed)
@@ -82,7 +84,7 @@ class Training(Trainer):
         self._go_on()
 
     def run(self, progress: Callable[[int], None] | None = None) -> None:
-        """See `Trainer`; what TensorBoard's thread could not write, such as to a full disk, is raised here."""
+        """Learn to the end; what TensorBoard's thread could not write, such as to a full disk, is raised here."""
         with _thread_raises_here(), self._curves():
             super().run(progress)
 
@@ -140,9 +142,10 @@ class Training(Trainer):
         self._load(read_state(checkpoint, "state"))
 
     def _parameters(self) -> dict[str, Any]:
+        optimisers = self._optimisers().items()
         parameters = {
             "policy": self.model.policy.state_dict(),
-            "optimisers": {name: optimiser.state_dict() for name, optimiser in self._optimisers().items()},
+            "optimisers": {name: optimiser.state_dict() for name, optimiser in optimisers},
             "rng": torch.get_rng_state(),
         }
         if getattr(self.model, "log_ent_coef", None) is not None:
@@ -160,41 +163,37 @@ class Training(Trainer):
         return {name: optimiser for name, optimiser in found.items() if optimiser is not None}
 
     def _state(self) -> dict[str, Any]:
-        model, normaliser = self.model, self._normaliser
-        statistics: dict[str, Any] = {"observation": normaliser.obs_rms, "return": normaliser.ret_rms}
-        numpy_state: Any = np.random.get_state()  # noqa: NPY002  the generator that SB3 shuffles with
+        model = self.model
         state = {
-            "decisions": model.num_timesteps,
-            "updates": model._n_updates,
-            "episodes": model._episode_num,
+            "model": {name: getattr(model, name) for name in _OF_MODEL},
+            "statistics": [[rms.mean, rms.var, float(rms.count)] for rms in self._statistics],
             "best": float(self._scores.best) if np.isfinite(self._scores.best) else None,
-            "normaliser": {name: [rms.mean, rms.var, float(rms.count)] for name, rms in statistics.items()},
-            "numpy": [numpy_state[0], numpy_state[1], *numpy_state[2:]],
-            "python": _listed(random.getstate()),
+            "numpy": _to_lists(np.random.get_state()),  # noqa: NPY002  the generator that SB3 shuffles with
+            "python": _to_lists(random.getstate()),
             "actions": model.action_space.np_random.bit_generator.state,
         }
         if isinstance(model, OffPolicyAlgorithm):
-            buffer = model.replay_buffer
-            names = [name for name in _REPLAY if hasattr(buffer, name)]
-            size = buffer.buffer_size if buffer.full else buffer.pos  # type: ignore[union-attr]
-            state["replay"] = {name: getattr(buffer, name)[:size] for name in names}
-            state["replay_at"] = [buffer.pos, bool(buffer.full)]  # type: ignore[union-attr]
+            buffer: Any = model.replay_buffer
+            size = buffer.buffer_size if buffer.full else buffer.pos
+            state["replay"] = {name: getattr(buffer, name)[:size] for name in _REPLAY if hasattr(buffer, name)}
+            state["replay_at"] = [buffer.pos, bool(buffer.full)]
         return state
 
     def _load(self, state: dict[str, Any]) -> None:
-        model, normaliser = self.model, self._normaliser
-        model.num_timesteps, model._n_updates = state["decisions"], state["updates"]
-        model._episode_num = state["episodes"]
+        model = self.model
+        for name, value in state["model"].items():
+            setattr(model, name, value)
+        for rms, (mean, variance, count) in zip(self._statistics, state["statistics"], strict=True):
+            rms.mean = mean
+            rms.var = variance
+            rms.count = count
         self._scores.best = np.inf if state["best"] is None else state["best"]
-        rms: Any
-        for name, rms in (("observation", normaliser.obs_rms), ("return", normaliser.ret_rms)):
-            mean, var, count = state["normaliser"][name]
-            rms.mean, rms.var, rms.count = mean, var, count
         np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
-        random.setstate(_tupled(state["python"]))
+        random.setstate(_to_tuples(state["python"]))
         model.action_space.np_random.bit_generator.state = state["actions"]
         if model.ep_info_buffer is None:
-            model.ep_info_buffer, model.ep_success_buffer = deque(maxlen=100), deque(maxlen=100)
+            model.ep_info_buffer = deque(maxlen=100)
+            model.ep_success_buffer = deque(maxlen=100)
         if isinstance(model, OffPolicyAlgorithm):
             buffer: Any = model.replay_buffer
             for name, values in state["replay"].items():
@@ -219,6 +218,11 @@ class Training(Trainer):
         model._last_obs = self._normaliser.reset()
         model._last_original_obs = self._normaliser.get_original_obs()
         model._last_episode_starts = np.ones(self.config.worlds, dtype=np.bool_)
+
+    @property
+    def _statistics(self) -> tuple[Any, Any]:
+        """Means and variances of the normaliser: of observations and of returns."""
+        return self._normaliser.obs_rms, self._normaliser.ret_rms
 
     def _portion(self) -> int:
         """Decisions of one call of `learn`, an iteration: a rollout of PPO; SAC itself goes on to its next update."""
@@ -268,12 +272,12 @@ def _thread_raises_here() -> Iterator[None]:
         threading.excepthook = before
 
 
-def _merged(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+def _merge(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     policy = {**defaults.get("policy_kwargs", {}), **(given.get("policy_kwargs") or {})}
     return {**defaults, **given, **({"policy_kwargs": policy} if policy else {})}
 
 
-def _resolved(options: dict[str, Any]) -> dict[str, Any]:
+def _with_activation(options: dict[str, Any]) -> dict[str, Any]:
     """Options with the activation's class in the place of its name."""
     policy = dict(options.get("policy_kwargs") or {})
     if isinstance(policy.get("activation_fn"), str):
@@ -281,9 +285,9 @@ def _resolved(options: dict[str, Any]) -> dict[str, Any]:
     return {**options, "policy_kwargs": policy}
 
 
-def _listed(value: Any) -> Any:
-    return [_listed(part) for part in value] if isinstance(value, tuple) else value
+def _to_lists(value: Any) -> Any:
+    return [_to_lists(part) for part in value] if isinstance(value, tuple) else value
 
 
-def _tupled(value: Any) -> Any:
-    return tuple(_tupled(part) for part in value) if isinstance(value, list) else value
+def _to_tuples(value: Any) -> Any:
+    return tuple(_to_tuples(part) for part in value) if isinstance(value, list) else value

@@ -2,12 +2,14 @@
 
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.markup import escape
 from rich.segment import Segment
+from rich.table import Table
 
 from train.runs.escaping import visible
 
@@ -23,7 +25,7 @@ class PlainConsole(Console):
         super().__init__(emoji=False, **options)  # a policy of the user may be called mine:zero
 
     def print(self, *objects: Any, markup: bool | None = None, **options: Any) -> None:
-        """See `Console`."""
+        """Print texts as they are, without markup."""
         highlight = options.get("highlight")
         parts = [
             self.render_str(part, markup=markup is True, highlight=highlight) if isinstance(part, str) else part
@@ -32,9 +34,27 @@ class PlainConsole(Console):
         super().print(*parts, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """See `Console`; the texts are visible, and what Rich itself asks of the terminal stays."""
+        """Render with visible texts, and what Rich itself asks of the terminal stays."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
+
+
+def make_table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1, **style: Any) -> Table:
+    """A table of plain texts.
+
+    Args:
+        title: Above the table.
+        head: Names of the columns.
+        rows: Cells.
+        left: How many of the first columns are aligned to the left; the others are numbers.
+        **style: Of Rich's table.
+    """
+    table = Table(title=escape(title), **style)
+    for number, name in enumerate(head):
+        table.add_column(escape(name), justify="left" if number < left else "right")
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
 
 
 def traceback_of(error: BaseException) -> str:

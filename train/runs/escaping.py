@@ -71,10 +71,10 @@ def markdown_text(text: str) -> str:
     """
     line = _SPACE.sub(" ", visible(text)).strip()
     line = _BACKSLASH.sub(r"\\\\", line)
-    return html.escape(_LINK.sub(_escaped, line), quote=False).replace("|", "\\|")
+    return html.escape(_LINK.sub(_escape, line), quote=False).replace("|", "\\|")
 
 
-def _escaped(found: re.Match[str]) -> str:
+def _escape(found: re.Match[str]) -> str:
     """A sign of Markdown as text."""
     sign = found[0]
     return f"{sign}\\" if sign == "]" else f"\\{sign}"
@@ -102,7 +102,7 @@ def _visible_data(value: Any) -> Any:
 
 
 def template_value(value: Any) -> Any:
-    """What a template puts into a page: plain text is made visible; HTML that a template made is a type of its own."""
+    """A value for a page: plain text is made visible; HTML that a template made is a type of its own."""
     return visible(value) if type(value) is str else value
 
 

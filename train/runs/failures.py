@@ -1,4 +1,4 @@
-"""What a user reads of a failure, and the exit code of `elastic`: one sentence each, from one place.
+"""Text of a failure, and the exit code of `elastic`: one sentence each, from one place.
 
 | exit code | meaning |
 |---|---|
@@ -16,7 +16,9 @@ from collections.abc import Iterator
 
 from train.runs.import_path import ShadowedError
 
-WRONG_INPUT, SYSTEM_FAILED, DEFECT = 2, 3, 70
+WRONG_INPUT = 2
+SYSTEM_FAILED = 3
+DEFECT = 70
 
 _EXTRAS = {
     "train": ("torch", "stable_baselines3", "tensorboard", "cmaes"),
@@ -40,7 +42,7 @@ class EndedError(KeyboardInterrupt):
     """A signal that asks to end; what is done at Ctrl-C is done for it too, such as torque off, and saying so."""
 
 
-def explained(error: BaseException) -> tuple[str, int] | None:
+def explain(error: BaseException) -> tuple[str, int] | None:
     """Sentence and exit code of a failure; None for a defect, of which the traceback is worth having."""
     if isinstance(error, ShadowedError):
         return str(error), WRONG_INPUT
@@ -63,23 +65,23 @@ def explained(error: BaseException) -> tuple[str, int] | None:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Whether it is Ctrl-C, which a module that is being loaded or a call of C may turn into an error of its own."""
+    """True if it is Ctrl-C, which a module that is being loaded or a call of C may turn into an error of its own."""
     return any(isinstance(cause, KeyboardInterrupt) or _quotes_interrupt(cause) for cause in _causes(error))
 
 
 def _quotes_interrupt(error: BaseException) -> bool:
-    """Whether `ctypes` met Ctrl-C while it converted an argument: its error only quotes the exception."""
+    """True if `ctypes` met Ctrl-C while it converted an argument: its error only quotes the exception."""
     names = (KeyboardInterrupt.__name__, EndedError.__name__)
     return isinstance(error, ctypes.ArgumentError) and any(name in str(error) for name in names)
 
 
 def is_unread(error: BaseException) -> bool:
-    """Whether it comes from a pipe whose reader has gone, such as `head`."""
+    """True if it comes from a pipe whose reader has gone, such as `head`."""
     return any(isinstance(cause, BrokenPipeError) for cause in _causes(error))
 
 
 def is_full(error: BaseException) -> bool:
-    """Whether it comes from a disk, a quota or a limit on files that leaves no room."""
+    """True if it comes from a disk, a quota or a limit on files that leaves no room."""
     return any(isinstance(cause, OSError) and cause.errno in _NO_ROOM for cause in _causes(error))
 
 

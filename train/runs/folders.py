@@ -26,7 +26,8 @@ RUNS = Path("runs")
 
 CONFIG = "config.yaml"
 """File of a run with its resolved configuration."""
-_LOCK, _RETRY_S = ".lock", 0.2
+_LOCK = ".lock"
+_RETRY_S = 0.2
 _LONGEST_HOLDER = 200
 """Characters of a lock that say who holds it."""
 _PACKAGES = ("elastic-env", "mujoco", "gymnasium", "pin", "numpy", "scipy", "stable-baselines3", "torch")
@@ -135,7 +136,7 @@ def require_name(name: str) -> str:
 
 
 @contextmanager
-def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
+def lock_run(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Keep other programs from a run for as long as this one works on it; a kill frees it.
 
     Args:
@@ -145,9 +146,9 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     Raises:
         ConfigurationError: Another program works on it, or the lock is no file of its own.
     """
-    with _opened_lock(folder / _LOCK) as file:
+    with _open_lock(folder / _LOCK) as file:
         last = time.monotonic() + patience_s
-        while not _is_taken(file):
+        while not _take_lock(file):
             if time.monotonic() >= last:
                 holder = file.read(_LONGEST_HOLDER).strip() or "unknown"
                 raise ConfigurationError(
@@ -160,7 +161,7 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
         yield
 
 
-def _opened_lock(path: Path) -> TextIO:
+def _open_lock(path: Path) -> TextIO:
     """The file of a lock, for reading and writing; a link, a pipe or a file of two names is none.
 
     Raises:
@@ -183,8 +184,8 @@ def _no_lock(path: Path) -> ConfigurationError:
     return ConfigurationError(f"{path} must be a plain file with one name, it is a link or something else; remove it")
 
 
-def _is_taken(lock: TextIO) -> bool:
-    """Whether a lock could be taken for this program."""
+def _take_lock(lock: TextIO) -> bool:
+    """Try to take a lock for this program; true if that worked."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -193,10 +194,10 @@ def _is_taken(lock: TextIO) -> bool:
 
 
 @contextmanager
-def locked_part(folder: Path, patience_s: float) -> Iterator[None]:
-    """`locked` for a part of a run, whose folder is made; it goes again if the work fails without a result."""
+def lock_part(folder: Path, patience_s: float) -> Iterator[None]:
+    """`lock_run` for a part of a run, whose folder is made; it goes again if the work fails without a result."""
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder, patience_s):
+    with lock_run(folder, patience_s):
         try:
             yield
         except BaseException:
@@ -275,11 +276,12 @@ def provenance(seed: int | None) -> dict[str, Any]:
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": {name: installed_version(name) for name in _PACKAGES},
     }
 
 
-def _version(package: str) -> str | None:
+def installed_version(package: str) -> str | None:
+    """Version of a package; None where it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Where modules are looked for: among what is installed first, in the working folder last.
+"""The path of imports: what is installed comes first, in the working folder last.
 
 Python puts the working folder, or a script's own, first: a user's `train.py` would then stand before our package, and a
 `multiprocessing.py` before the standard library, also in each process that is started.

@@ -6,16 +6,40 @@ from typing import Any
 TELLING = {
     "comparison": (
         "elastic compare",
-        {"references", "policies", "episodes", "scenario_episodes", "reference_scenarios", "figure_policies", "sweep",
-         "map", "groups", "leaderboard"},
+        {
+            "references",
+            "policies",
+            "episodes",
+            "scenario_episodes",
+            "reference_scenarios",
+            "figure_policies",
+            "sweep",
+            "map",
+            "groups",
+            "leaderboard",
+        },
     ),
     "training": (
         "elastic train",
-        {"weights", "base", "base_options", "settings", "algorithm", "algorithm_options", "anneal", "clip", "worlds",
-         "decisions", "seeds", "evaluate_every", "evaluation_episodes", "checkpoint_every"},
+        {
+            "weights",
+            "base",
+            "base_options",
+            "settings",
+            "algorithm",
+            "algorithm_options",
+            "anneal",
+            "clip",
+            "worlds",
+            "decisions",
+            "seeds",
+            "evaluate_every",
+            "evaluation_episodes",
+            "checkpoint_every",
+        },
     ),
     "bench": ("elastic bench", {"cases", "margin"}),
-}  # fmt: skip
+}
 """Command of each kind, and keys that no other kind has."""
 
 

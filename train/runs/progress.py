@@ -12,7 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 _LEAST_S = 10.0
 """Time between two lines of progress in a log [s]; shorter work says nothing."""
-_ANNOUNCED_S, _LONG_S = 3.0, 30.0
+_ANNOUNCED_S = 3.0
+_LONG_S = 30.0
 """When the time to go is said, and from how much on [s]."""
 
 
@@ -51,7 +52,8 @@ def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -
         least_s: Shortest time between two lines, and before the first one [s].
         unit: What is counted, such as control steps; a line with a note names it, since the note counts others.
     """
-    said, when = 0, time.monotonic()
+    said = 0
+    when = time.monotonic()
     first: tuple[float, float] | None = None  # processes take their time to start
     is_announced = False
 
@@ -60,14 +62,16 @@ def plain_progress(console: Console, least_s: float = 0.0, unit: str = "work") -
         if share <= 0.0:
             return
         first = first or (time.monotonic(), share)
-        elapsed, done = time.monotonic() - first[0], share - first[1]
+        elapsed = time.monotonic() - first[0]
+        done = share - first[1]
         to_go = elapsed * (1.0 - share) / done if done > 0.0 else 0.0
         if not is_announced and done > 0.0 and elapsed > _ANNOUNCED_S:
             is_announced = True
             if to_go > _LONG_S:
                 console.print(f"  about {duration(to_go)} to go")
         if int(10 * share) > said and time.monotonic() - when >= least_s:
-            said, when = int(10 * share), time.monotonic()
+            said = int(10 * share)
+            when = time.monotonic()
             more = f" of the {unit}, about {duration(to_go)} to go; {note}" if note else ""
             console.print(f"  {10 * said} %{more}", soft_wrap=True)
 
@@ -113,7 +117,8 @@ def show_progress(
 
 
 def _lines(console: Console, totals: Mapping[str, int], unit: str) -> Callable[..., None]:
-    say, done = plain_progress(console, _LEAST_S, unit), [0] * len(totals)
+    say = plain_progress(console, _LEAST_S, unit)
+    done = [0] * len(totals)
 
     def count(number: int, amount: int, note: str = "") -> None:
         done[number] = amount
@@ -129,7 +134,8 @@ def say_what_is_compiled(console: Console) -> Iterator[None]:
     Args:
         console: Where it is said.
     """
-    handler, level = _FirstRecord(console), _COMPILER.level
+    handler = _FirstRecord(console)
+    level = _COMPILER.level
     _COMPILER.addHandler(handler)
     _COMPILER.setLevel(logging.INFO)
     try:
@@ -144,10 +150,11 @@ class _FirstRecord(logging.Handler):
 
     def __init__(self, console: Console) -> None:
         super().__init__(logging.INFO)
-        self._console, self._is_said = console, False
+        self._console = console
+        self._is_said = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler`."""
+        """Print the first record."""
         if self._is_said:
             return
         self._is_said = True

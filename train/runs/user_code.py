@@ -44,10 +44,10 @@ def require_no_code(file: Path, names: Iterable[str]) -> None:
     """
     for name in names:
         if ":" in name:
-            raise _untrusted(file, name)
+            raise _trust_error(file, name)
 
 
-def _untrusted(file: Path, name: str) -> ConfigurationError:
+def _trust_error(file: Path, name: str) -> ConfigurationError:
     return ConfigurationError(
         f"{file} names {shown(name)}, whose code would run; look at it, then say --trust-code, or name a "
         "configuration of yours"
@@ -55,7 +55,7 @@ def _untrusted(file: Path, name: str) -> ConfigurationError:
 
 
 def named_object(name: str) -> Any:
-    """What a name stands for.
+    """The object that a name stands for.
 
     Args:
         name: "module:attribute", or "FILE.py:attribute" with the path of a file, which need not be on the module path.
@@ -65,7 +65,7 @@ def named_object(name: str) -> Any:
             refused here, and nothing was imported.
     """
     if (file := _REFUSED_IN.get()) is not None:
-        raise _untrusted(file, name)
+        raise _trust_error(file, name)
     place, _, attribute = name.rpartition(":")
     try:
         module = _from_file(Path(place)) if place.endswith(".py") else _from_path(place)

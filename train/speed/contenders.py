@@ -1,4 +1,4 @@
-"""What `elastic speed` times: every contender plays control steps of one environment and says how long it took."""
+"""Contenders of `elastic speed`: each plays control steps of one environment and says how long it took."""
 
 import itertools
 import threading
@@ -64,11 +64,12 @@ class VectorLoop(Contender):
         self._action = np.zeros(self.env.action_space.shape, dtype=np.float32)
         self._observation, _ = self.env.reset(seed=0)
         self._state: Any = None
-        self._start, self._done = np.ones(num_envs, dtype=np.bool_), np.zeros(num_envs, dtype=np.bool_)
+        self._start = np.ones(num_envs, dtype=np.bool_)
+        self._done = np.zeros(num_envs, dtype=np.bool_)
         self.controls = np.empty((0, *self.env.unwrapped.simulation.ctrl.shape))
 
     def run(self, steps: int) -> float:
-        """See `Contender`."""
+        """Play about so many control steps in every world; control steps per second of all worlds."""
         ctrl = self.env.unwrapped.simulation.ctrl
         self.controls = np.empty((steps, *ctrl.shape))
         begin = time.perf_counter()
@@ -83,13 +84,16 @@ class VectorLoop(Contender):
         if self._policy is not None:
             self._action, self._state = self._policy.predict(self._observation, self._state, self._start, True)
         self._observation, _, terminated, truncated, _ = self.env.step(self._action)
-        self._start, self._done = self._done, terminated | truncated  # a world that ends begins a step later
+        # a world that ends begins a step later
+        self._start = self._done
+        self._done = terminated | truncated
 
 
 class ScalarLoop(Contender):
     """Our scalar environment under zero offsets, without Gymnasium's checks; keeps the servo inputs of its last run."""
 
-    title, num_envs = "scalar env", 1
+    title = "scalar env"
+    num_envs = 1
 
     def __init__(self, env: str) -> None:
         self.env: Any = _make(env).unwrapped
@@ -98,7 +102,7 @@ class ScalarLoop(Contender):
         self.controls = np.empty((0, *self.env.simulation.ctrl.shape))
 
     def run(self, steps: int) -> float:
-        """See `Contender`."""
+        """Play about so many control steps in every world; control steps per second of all worlds."""
         ctrl = self.env.simulation.ctrl
         self.controls = np.empty((steps, *ctrl.shape))
         begin = time.perf_counter()
@@ -120,14 +124,17 @@ class RawWorlds(Contender):
     title = "raw mj_step"
 
     def __init__(self, loop: VectorLoop | ScalarLoop, threads: int) -> None:
-        task, simulation = loop.env.unwrapped.task, loop.env.unwrapped.simulation
-        self._loop, self.num_envs = loop, loop.num_envs
-        self._model, self._substeps = task.model, task.num_substeps
+        task = loop.env.unwrapped.task
+        simulation = loop.env.unwrapped.simulation
+        self._loop = loop
+        self.num_envs = loop.num_envs
+        self._model = task.model
+        self._substeps = task.num_substeps
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
         self.states = np.stack([self._state_of(simulation, world) for world in range(self.num_envs)])
 
     def run(self, steps: int) -> float:
-        """See `Contender`; as many steps as the environment played last."""
+        """Play as many steps as the environment played last."""
         return self.num_envs * steps / self.play(self._loop.controls)
 
     def play(self, controls: Array) -> float:
@@ -141,10 +148,12 @@ class RawWorlds(Contender):
         return time.perf_counter() - begin
 
     def close(self) -> None:
-        """See `Contender`."""
+        """Play about so many control steps in every world; control steps per second of all worlds."""
 
     def _play(self, thread: int, controls: Array) -> None:
-        model, data, substeps = self._model, self._data[thread], self._substeps
+        model = self._model
+        data = self._data[thread]
+        substeps = self._substeps
         for world in range(thread, len(self.states), len(self._data)):
             mujoco.mj_setState(model, data, self.states[world], _STATE)
             ctrl = data.ctrl
@@ -155,10 +164,13 @@ class RawWorlds(Contender):
 
     def _state_of(self, simulation: Any, world: int) -> Array:
         """Integration state of a world of the environment."""
-        data, state = self._data[0], np.empty(mujoco.mj_stateSize(self._model, _STATE))
+        data = self._data[0]
+        state = np.empty(mujoco.mj_stateSize(self._model, _STATE))
         mujoco.mj_resetData(self._model, data)
-        data.qpos[:], data.qvel[:] = simulation.qpos[world], simulation.qvel[world]
-        data.act[:], data.ctrl[:] = simulation.act[world], simulation.ctrl[world]
+        data.qpos[:] = simulation.qpos[world]
+        data.qvel[:] = simulation.qvel[world]
+        data.act[:] = simulation.act[world]
+        data.ctrl[:] = simulation.ctrl[world]
         data.qacc_warmstart[:] = simulation.bind("qacc_warmstart")[world]
         mujoco.mj_getState(self._model, data, state, _STATE)
         return state
@@ -170,7 +182,7 @@ class _ForeignLoop(Contender):
     _action: Array
 
     def run(self, steps: int) -> float:
-        """See `Contender`."""
+        """Play about so many control steps in every world; control steps per second of all worlds."""
         begin = time.perf_counter()
         for _ in range(steps):
             self.env.step(self._action)
@@ -181,7 +193,8 @@ class GymnasiumLoop(_ForeignLoop):
     """Scalar environments of ours under Gymnasium's SyncVectorEnv or AsyncVectorEnv, one process each in the latter."""
 
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
-        self.title, self.num_envs = f"Gymnasium {kind.capitalize()}VectorEnv", num_envs
+        self.title = f"Gymnasium {kind.capitalize()}VectorEnv"
+        self.num_envs = num_envs
         self.env = gymnasium.make_vec(
             environment(env).id, num_envs=num_envs, vectorization_mode=kind, **_arguments(env)
         )
@@ -195,7 +208,8 @@ class SB3Loop(_ForeignLoop):
     def __init__(self, env: str, kind: str, num_envs: int) -> None:
         from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-        self.title, self.num_envs = f"SB3 {kind}", num_envs
+        self.title = f"SB3 {kind}"
+        self.num_envs = num_envs
         makers = [_Maker(env)] * num_envs
         self.env = DummyVecEnv(makers) if kind == "DummyVecEnv" else SubprocVecEnv(makers, start_method="spawn")
         self.env.reset()
@@ -215,7 +229,8 @@ class PPOLoop(Contender):
         from train.learn.sb3_env import SB3VecEnv
 
         where = f"SubprocVecEnv({num_envs})" if processes else "vector env"
-        self.title, self.num_envs = f"PPO with {policy}, {where}", num_envs
+        self.title = f"PPO with {policy}, {where}"
+        self.num_envs = num_envs
         acts_on = COMMAND if policy in ("zero", "uncompensated", "uncompensated_open") else DEFLECTION
         if processes:
             venv: Any = SubprocVecEnv([_Maker(env, policy, acts_on)] * num_envs, start_method="spawn")
@@ -226,15 +241,22 @@ class PPOLoop(Contender):
         torch.set_num_threads(1)
         self._rollout = max(PPO_DECISIONS // num_envs, 8)
         self._model = PPO(
-            "MlpPolicy", venv, n_steps=self._rollout, batch_size=512, n_epochs=10, gamma=0.95, device="cpu",
+            "MlpPolicy",
+            venv,
+            n_steps=self._rollout,
+            batch_size=512,
+            n_epochs=10,
+            gamma=0.95,
+            device="cpu",
             policy_kwargs={"net_arch": [64, 64]},
-        )  # fmt: skip
+        )
         self._model.set_logger(Logger(folder=None, output_formats=[]))  # SB3's own makes a folder in /tmp
         self.env = self._model.get_env()
 
     def run(self, steps: int) -> float:  # noqa: ARG002  a whole iteration is the least there is
-        """See `Contender`: one iteration of `PPO_DECISIONS`, or of 8 in each world."""
-        before, begin = self._model.num_timesteps, time.perf_counter()
+        """Learn for one iteration of `PPO_DECISIONS`, or of 8 in each world."""
+        before = self._model.num_timesteps
+        begin = time.perf_counter()
         self._model.learn(self._rollout * self.num_envs, reset_num_timesteps=False)
         return (self._model.num_timesteps - before) * self._period / (time.perf_counter() - begin)
 
@@ -243,7 +265,8 @@ def untrained_residual(base: Any, env: Any) -> ResidualPolicy:
     """A residual with a network of 64×64 as it is before training, small random weights, around a base policy."""
     acts_on = DEFLECTION if DEFLECTION in inputs_of(base) else COMMAND
     corrected = Corrected(base, env.unwrapped.assumed_model, ResidualSettings(acts_on={acts_on: None}))
-    features, generator = Features(corrected).width, np.random.default_rng(0)
+    features = Features(corrected).width
+    generator = np.random.default_rng(0)
     widths = [features, 64, 64, corrected.num_residuals]
     tensors = {"mean": np.zeros(features), "std": np.ones(features)}
     for i, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
@@ -256,7 +279,9 @@ class _Maker:
     """Makes a scalar environment in a process of its own, with the residual of a base policy around it or without."""
 
     def __init__(self, env: str, policy: str | None = None, acts_on: str = DEFLECTION) -> None:
-        self._env, self._policy, self._acts_on = env, policy, acts_on
+        self._env = env
+        self._policy = policy
+        self._acts_on = acts_on
 
     def __call__(self) -> Any:
         """The environment."""

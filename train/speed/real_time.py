@@ -12,29 +12,20 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.hardware.safety.realtime import Priority, give_up_realtime, prefer_realtime
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.rollout import control_steps, make_policy, policy_errors
+from train.runs.console import make_table
 from train.runs.folders import run_folder
 
 _PERCENTILES = {"median": 50.0, "p99": 99.0, "p999": 99.9}
 
 
-class RealTimeConfig(Model):
-    """What `elastic speed --real-time` plays."""
-
-    env: str = "walker"
-    policy: str | None = None
-    """Policy that is timed; None for adaptive_posture on the walker, input on the testbed."""
-    seconds: float = quantity("s", 60.0, gt=0.0, le=86_400.0, description="how long it is played against the clock")
-
-
 @dataclass(frozen=True)
 class RealTimeResult:
-    """What a policy kept of its time.
+    """Latencies of a policy against the clock.
 
     The latency of a cycle is the time from the moment at which it is due to the moment at which its command is ready.
     So it has the delay with which the system wakes the program. The time in the policy is without that.
@@ -74,57 +65,66 @@ class RealTimeResult:
     policy_max_us: float
 
 
-def play_against_the_clock(config: RealTimeConfig) -> RealTimeResult:
+def play_against_the_clock(env_name: str, policy_name: str | None, seconds: float) -> RealTimeResult:
     """Record what the policy observes in an episode, then call it with that once in every control period.
 
     The loop asks for real-time scheduling, as the one of a motion on hardware does, and tells whether it has it.
 
     The episode begins again, with a policy that remembers nothing, where it is shorter than what is to be played.
 
+    Args:
+        env_name: Environment.
+        policy_name: Policy that is timed; None for adaptive_posture on the walker, input on the testbed.
+        seconds: How long it is played against the clock [s].
+
     Raises:
         ConfigurationError: Environment or policy does not exist.
         PolicyFailedError: The policy failed.
     """
-    known = environment(config.env)
-    name = config.policy or known.live_policy or known.looped_policy
-    condition = Condition(env=config.env, policy=PolicySpec(name=name), reference=known.default_reference)
+    known = environment(env_name)
+    name = policy_name or known.live_policy or known.looped_policy
+    condition = Condition(env=env_name, policy=PolicySpec(name=name), reference=known.default_reference)
     env = gymnasium.make(condition.environment.id, **condition.arguments)
     try:
         policy = make_policy(condition.policy, env)
         period_s = env.unwrapped.assumed_model.control_period_s  # type: ignore[attr-defined]
-        cycles = max(round(config.seconds / period_s), 1)
+        cycles = max(round(seconds / period_s), 1)
         with policy_errors(condition):
-            observations = _recorded(env, policy, cycles)
+            observations = _record(env, policy, cycles)
             is_real_time = prefer_realtime(Priority.LOOP)
             try:
-                latency_s, policy_s = _timed(policy, observations, cycles, period_s)
+                latency_s, policy_s = _time(policy, observations, cycles, period_s)
             finally:
                 give_up_realtime()
     finally:
         env.close()
-    return summary(config.env, name, period_s, latency_s, policy_s, is_real_time=is_real_time)
+    return summary(env_name, name, period_s, latency_s, policy_s, is_real_time=is_real_time)
 
 
-def _recorded(env: Any, policy: Any, most: int) -> list[Any]:
+def _record(env: Any, policy: Any, most: int) -> list[Any]:
     """Observations of an episode with the policy in its loop, at most so many."""
     steps = list(islice(control_steps(env, policy, seed=0), max(most - 1, 1)))
     return [steps[0].seen, *(step.observation for step in steps)][:most]
 
 
-def _timed(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:
+def _time(policy: Any, observations: list[Any], cycles: int, period_s: float) -> tuple[Array, Array]:
     """Latency and time in the policy, (cycles,) [s]; a cycle that begins late is not left out."""
-    latency_s, policy_s = np.empty(cycles), np.empty(cycles)
+    latency_s = np.empty(cycles)
+    policy_s = np.empty(cycles)
     state: Any = None
     begin = time.perf_counter() + period_s
     for number, (index, observation) in enumerate(islice(cycle(enumerate(observations)), cycles)):
-        due, memory, start = begin + number * period_s, state if index else None, np.array(index == 0)
+        due = begin + number * period_s
+        memory = state if index else None
+        start = np.array(index == 0)
         remaining = due - time.perf_counter()
         if remaining > 0.0:
             time.sleep(remaining)
         called = time.perf_counter()
         _, state = policy.predict(observation, state=memory, episode_start=start, deterministic=True)
         ready = time.perf_counter()
-        latency_s[number], policy_s[number] = ready - due, ready - called
+        latency_s[number] = ready - due
+        policy_s[number] = ready - called
     return latency_s, policy_s
 
 
@@ -148,16 +148,26 @@ def summary(
         for name, percentile in (*_PERCENTILES.items(), ("max", 100.0))
     }
     return RealTimeResult(
-        env=env, policy=policy, is_real_time=is_real_time, period_us=1e6 * period_s, cycles=len(latency_s),
-        late=late, late_share=late / len(latency_s), **figures,
-    )  # fmt: skip
+        env=env,
+        policy=policy,
+        is_real_time=is_real_time,
+        period_us=1e6 * period_s,
+        cycles=len(latency_s),
+        late=late,
+        late_share=late / len(latency_s),
+        **figures,
+    )
 
 
-def measure_real_time(config: RealTimeConfig, console: Console, output: Path | None = None) -> Path:
+def measure_real_time(
+    env: str, policy: str | None, seconds: float, console: Console, output: Path | None = None
+) -> Path:
     """Play, print the latencies, and write them as JSON.
 
     Args:
-        config: What to play.
+        env: Environment.
+        policy: Policy that is timed; None for the environment's own.
+        seconds: How long it is played [s].
         console: Where the table goes.
         output: Folder for the result; default runs/speed, numbered if taken.
 
@@ -169,9 +179,9 @@ def measure_real_time(config: RealTimeConfig, console: Console, output: Path | N
         PolicyFailedError: The policy failed.
         ResultsExistError: The output folder holds results.
     """
-    with run_folder("speed", config.model_dump(mode="json"), 0, output) as folder:
-        console.print(f"recording an episode, then {config.seconds:g} s against the clock")
-        result = play_against_the_clock(config)
+    with run_folder("speed", {"env": env, "policy": policy, "seconds": seconds}, 0, output) as folder:
+        console.print(f"recording an episode, then {seconds:g} s against the clock")
+        result = play_against_the_clock(env, policy, seconds)
         path = folder / "real_time.json"
         path.write_text(json.dumps(asdict(result), indent=2) + "\n")
     console.print(_table(result))
@@ -182,10 +192,10 @@ def measure_real_time(config: RealTimeConfig, console: Console, output: Path | N
 
 
 def _table(result: RealTimeResult) -> Table:
-    table = Table(title=f"{result.policy} on the {result.env}, once in {result.period_us:.0f} µs; times in µs")
-    for name in ("", "median", "99 %", "99.9 %", "longest"):
-        table.add_column(name, justify="right" if name else "left")
+    title = f"{result.policy} on the {result.env}, once in {result.period_us:.0f} µs; times in µs"
     figures = asdict(result)
-    for title, key in (("from due to command", "latency"), ("in the policy", "policy")):
-        table.add_row(title, *(f"{figures[f'{key}_{name}_us']:.0f}" for name in (*_PERCENTILES, "max")))
-    return table
+    rows = [
+        (what, *(f"{figures[f'{key}_{name}_us']:.0f}" for name in (*_PERCENTILES, "max")))
+        for what, key in (("from due to command", "latency"), ("in the policy", "policy"))
+    ]
+    return make_table(title, ["", "median", "99 %", "99.9 %", "longest"], rows)

@@ -43,8 +43,8 @@ class WorkerKilledError(SystemFailedError):
         )
 
 
-class PlaceLostError(SystemFailedError):
-    """What runs the calls is gone: the scheduler of a cluster."""
+class ExecutorLostError(SystemFailedError):
+    """The executor is gone: the scheduler of a cluster."""
 
 
 class UnguardedScriptError(ConfigurationError):
@@ -59,7 +59,7 @@ class UnguardedScriptError(ConfigurationError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a call.
+    """Result of a call.
 
     Attributes:
         value: What it returned.
@@ -89,7 +89,7 @@ class Pool:
 
 @dataclass(frozen=True)
 class Home:
-    """What a worker takes over from the program that calls it.
+    """Folder and versions of the program, which its workers take over.
 
     Attributes:
         folder: Working folder, from which configurations name files.
@@ -168,7 +168,7 @@ def run_calls(
 
     Raises:
         VersionsDifferError: A machine has other versions.
-        PlaceLostError: The executor is gone.
+        ExecutorLostError: The executor is gone.
         UnguardedScriptError: Workers cannot import the script that runs here.
         KeyboardInterrupt: Ctrl-C for the second time, or the first where `finishes` is false.
     """
@@ -187,11 +187,18 @@ class _Run:
     def __init__(
         self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], pool: Pool, watch: Watch
     ) -> None:
-        self._function, self._arguments, self._pool, self._watch = function, arguments, pool, watch
-        self._home, self._futures = Home.here(), dict[Future[Any], int]()
-        self._tries, self._running, self._is_ending = [0] * len(arguments), set[int](), False
+        self._function = function
+        self._arguments = arguments
+        self._pool = pool
+        self._watch = watch
+        self._home = Home.here()
+        self._futures = dict[Future[Any], int]()
+        self._tries = [0] * len(arguments)
+        self._running = set[int]()
+        self._is_ending = False
+        self._done = 0
+        self._failed = 0
         self.outcomes: list[Outcome | None] = [None] * len(arguments)
-        self._done = self._failed = 0
 
     def go(self, asked: threading.Event) -> None:
         """To the end of all calls, or once `asked` to, of those that run."""
@@ -206,11 +213,12 @@ class _Run:
 
     def _submit(self, number: int) -> None:
         self._tries[number] += 1
-        given = self._function, self._arguments[number], number, self._home, self._pool.reporter
         try:
-            future = self._pool.executor.submit(carried_out, *given)
+            future = self._pool.executor.submit(
+                carry_out, self._function, self._arguments[number], number, self._home, self._pool.reporter
+            )
         except RuntimeError as error:  # it was shut down
-            raise PlaceLostError(f"the workers are gone: {error}") from None
+            raise ExecutorLostError(f"the workers are gone: {error}") from None
         self._futures[future] = number
         future.add_done_callback(self._pool.events.put)
 
@@ -234,7 +242,7 @@ class _Run:
     def _end(self, number: int, future: Future[Any]) -> None:
         self._running.discard(number)
         outcome = _outcome(future)
-        if isinstance(outcome.error, VersionsDifferError | PlaceLostError | UnguardedScriptError):
+        if isinstance(outcome.error, VersionsDifferError | ExecutorLostError | UnguardedScriptError):
             raise outcome.error
         if isinstance(outcome.error, WorkerLostError):
             if self._is_ending:
@@ -250,7 +258,7 @@ class _Run:
         self._watch.ended(number, outcome)
 
 
-def carried_out(
+def carry_out(
     function: Callable[..., Any], given: tuple[Any, ...], number: int, home: Home, reporter: Reporter
 ) -> Outcome:
     """In a worker: the outcome of a call, which never raises."""
@@ -282,17 +290,20 @@ def _portable(error: Exception) -> Exception:
 
 def _outcome(future: Future[Any]) -> Outcome:
     if future.cancelled():
-        return Outcome(error=PlaceLostError("the workers are gone: they dropped what was to be done"))
+        return Outcome(error=ExecutorLostError("the workers are gone: they dropped what was to be done"))
     error = future.exception()
     if error is None:
         return future.result()
+    if type(error).__name__ == "KilledWorker":  # of dask, which has moved the call itself
+        return Outcome(error=WorkerKilledError())
     return Outcome(error=error if isinstance(error, Exception) else CallFailedError(repr(error)))
 
 
 @contextmanager
 def _first_ctrl_c() -> Iterator[threading.Event]:
     """Ctrl-C sets an event; the second one does what it did before."""
-    asked, before = threading.Event(), signal.getsignal(signal.SIGINT)
+    asked = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield asked
         return

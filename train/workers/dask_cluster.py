@@ -2,17 +2,15 @@
 
 import ipaddress
 import logging
-import queue
 import socket
 import uuid
 import warnings
-from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Executor, Future
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, missing_extra
-from train.workers.calls import MOST_MOVES, PlaceLostError, Pool, WorkerKilledError
+from train.workers.calls import MOST_MOVES, Pool
 from train.workers.versions import everything, require_same
 
 _CONNECT_S = 10
@@ -48,14 +46,14 @@ def dask_pool(address: str) -> Iterator[Pool]:
     with client:
         _prepare(client, address)
         topic = f"elastic-{uuid.uuid4().hex}"
-        pool = Pool(_Cluster(client), _LogEvent(topic))
-        client.subscribe_topic(topic, _into(pool.events))
+        pool = Pool(client.get_executor(pure=False), _LogEvent(topic))
+        client.subscribe_topic(topic, lambda event: pool.events.put(tuple(event[1])))
         try:
             yield pool
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 client.unsubscribe_topic(topic)
-            pool.executor.shutdown(wait=False, cancel_futures=True)
+                pool.executor.shutdown(wait=False)  # cancels what runs
 
 
 def warn_of_public(address: str) -> None:
@@ -104,48 +102,6 @@ def _limit_moves(most: int, dask_scheduler: Any = None) -> None:
     dask_scheduler.allowed_failures = min(dask_scheduler.allowed_failures, most)
 
 
-class _Cluster(Executor):
-    """A dask client as an executor.
-
-    Dask's own executor keeps every result in the memory of its worker until the end. When the worker is lost, dask
-    makes such results anew. Here a result is released as soon as it has arrived.
-    """
-
-    def __init__(self, client: Any) -> None:
-        self._client, self._futures = client, set[Any]()
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """See `Executor`."""
-        future, ours = self._client.submit(fn, *args, **kwargs, pure=False), Future[Any]()
-        self._futures.add(future)
-        future.add_done_callback(lambda done: self._settle(done, ours))
-        ours.add_done_callback(lambda _: future.cancel() if ours.cancelled() else None)
-        return ours
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See `Executor`."""
-        futures = list(self._futures)
-        with suppress(Exception):  # the scheduler may be gone
-            if cancel_futures:
-                self._client.cancel(futures)
-            elif wait:
-                for future in futures:
-                    future.exception()
-
-    def _settle(self, future: Any, ours: "Future[Any]") -> None:
-        """In dask's thread for it: hand on what came of a call, and release it."""
-        try:
-            if ours.set_running_or_notify_cancel():
-                ours.set_result(future.result())
-        except CancelledError:
-            ours.set_exception(PlaceLostError("the dask scheduler is gone, or it has dropped the calls"))
-        except Exception as error:
-            lost = type(error).__name__ == "KilledWorker"
-            ours.set_exception(WorkerKilledError() if lost else error)
-        self._futures.discard(future)
-        future.release()
-
-
 class _LogEvent:
     """Reports as events of dask, from a worker by its scheduler to the client."""
 
@@ -156,11 +112,3 @@ class _LogEvent:
         from distributed import get_worker
 
         get_worker().log_event(self._topic, (number, value))
-
-
-def _into(events: "queue.SimpleQueue[Any]") -> Callable[[Any], None]:
-    def take(event: Any) -> None:
-        number, value = event[1]
-        events.put((number, value))
-
-    return take

@@ -70,11 +70,14 @@ class Processes(Executor):
 
     def __init__(self, jobs: int, events: "queue.SimpleQueue[Any]") -> None:
         self._threads = ThreadPoolExecutor(jobs, initializer=_block_ctrl_c)
-        self._own, self._lock, self._events = threading.local(), threading.Lock(), events
-        self._workers, self._is_closed = set[_Worker](), False
+        self._own = threading.local()
+        self._lock = threading.Lock()
+        self._events = events
+        self._workers = set[_Worker]()
+        self._is_closed = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """See `Executor`.
+        """Run a call in a process.
 
         The future raises `WorkerLostError` where the process died, and `UnguardedScriptError` where it ended itself
         before it could begin.
@@ -82,7 +85,7 @@ class Processes(Executor):
         return self._threads.submit(self._in_process, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See `Executor`."""
+        """End the processes when their calls have ended."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
         for worker in self._workers:
             worker.pool.shutdown(wait)
@@ -105,7 +108,8 @@ class Processes(Executor):
                 future = self._worker().pool.submit(fn, *args, **kwargs)
             return future.result()
         except BrokenProcessPool:
-            lost, self._own.worker = self._own.worker, None
+            lost = self._own.worker
+            self._own.worker = None
             with self._lock:
                 self._workers.discard(lost)
             raise lost.why() from None

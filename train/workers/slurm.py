@@ -4,6 +4,7 @@ import os
 import queue
 import shutil
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
@@ -12,13 +13,13 @@ from typing import Any, Literal
 
 from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import SystemFailedError, missing_extra
-from train.workers.calls import PlaceLostError, Pool, WorkerLostError
+from train.workers.calls import ExecutorLostError, Pool, WorkerLostError
 
 _POLL_S = 0.5
 
 
 class SlurmConfig(Model):
-    """What a job asks Slurm for; a call is a job of an array."""
+    """Limits that a job asks Slurm for; a call is a job of an array."""
 
     cluster: Literal["slurm", "local"] = "slurm"
     """slurm, or local: processes of this machine in the place of jobs, to try it without Slurm."""
@@ -26,18 +27,21 @@ class SlurmConfig(Model):
     """Partition; None for Slurm's default."""
     account: Title | None = None
     """Account that is charged; None for Slurm's default."""
-    time_min: int = quantity("min", 60, ge=1, le=100_000, description="longest time of a job")
-    memory_gb: float = quantity("GB", 4.0, gt=0, le=10_000, description="memory of a job")
-    cores: int = quantity("1", 1, ge=1, le=1024, description="cores of a job")
-    at_once: int = quantity("1", 256, ge=1, le=100_000, description="jobs that run at the same time")
+    time_min: int = quantity("min", 60, ge=1, le=100_000)
+    """Longest time of a job [min]."""
+    memory_gb: float = quantity("GB", 4.0, gt=0, le=10_000)
+    """Memory of a job [GB]."""
+    cores: int = quantity("1", 1, ge=1, le=1024)
+    """Cores of a job."""
+    at_once: int = quantity("1", 256, ge=1, le=100_000)
+    """Jobs that run at the same time."""
 
     def parameters(self) -> dict[str, Any]:
         """As submitit calls them."""
         own = {"partition": self.partition, "account": self.account, "array_parallelism": self.at_once}
-        return {
-            "name": "elastic", "timeout_min": self.time_min, "mem_gb": self.memory_gb, "cpus_per_task": self.cores,
-            **{f"slurm_{name}": value for name, value in own.items() if value is not None},
-        }  # fmt: skip
+        named = {f"slurm_{name}": value for name, value in own.items() if value is not None}
+        limits = {"timeout_min": self.time_min, "mem_gb": self.memory_gb, "cpus_per_task": self.cores}
+        return {"name": "elastic", **limits, **named}
 
 
 @contextmanager
@@ -89,24 +93,27 @@ class Jobs(Executor):
 
     def __init__(self, executor: Any, reports: Path) -> None:
         self.events: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._executor, self._reports, self._reported = executor, reports, dict[str, int]()
-        self._waiting: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = queue.SimpleQueue()
-        self._jobs, self._closed = dict[Future[Any], Any](), threading.Event()
+        self._executor = executor
+        self._reports = reports
+        self._reported = dict[str, int]()
+        self._waiting = deque[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]]()
+        self._jobs = dict[Future[Any], Any]()
+        self._closed = threading.Event()
         self._thread = threading.Thread(target=self._look_after, daemon=True)
         self._thread.start()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """See `Executor`; keyword arguments are not passed on."""
+        """Keep a call for the next array of jobs; keyword arguments are not passed on."""
         if kwargs:
             raise TypeError(f"calls have no keyword arguments, got {sorted(kwargs)}")
         if self._closed.is_set():
             raise RuntimeError("it was shut down")
         future = Future[Any]()
-        self._waiting.put((future, fn, args))
+        self._waiting.append((future, fn, args))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See `Executor`; jobs that are not done are cancelled."""
+        """Submit nothing any more; with `cancel_futures` jobs that are not done are cancelled."""
         self._closed.set()
         if wait:
             self._thread.join()
@@ -122,20 +129,22 @@ class Jobs(Executor):
                 self._submit_waiting()
                 self._read_reports()
                 self._settle_done()
-            except Exception as error:
-                self._give_up(error)
+            except Exception as error:  # Slurm refuses, or the folder is full: that is the end of all calls
+                lost = ExecutorLostError(f"jobs cannot be submitted or followed: {error}")
+                for future in [*self._jobs, *(future for future, *_ in self._waiting)]:
+                    if not future.cancelled():
+                        future.set_exception(lost)
                 return
 
     def _submit_waiting(self) -> None:
-        new = []
-        with suppress(queue.Empty):
-            while True:
-                new.append(self._waiting.get_nowait())
-        new = [(future, fn, args) for future, fn, args in new if not future.cancelled()]
-        if new:
+        waiting = list(self._waiting)
+        calls = [call for call in waiting if not call[0].cancelled()]
+        if calls:
             with self._executor.batch():
-                jobs = [self._executor.submit(fn, *args) for _, fn, args in new]
-            self._jobs.update(zip((future for future, _, _ in new), jobs, strict=True))
+                jobs = [self._executor.submit(fn, *args) for _, fn, args in calls]
+            self._jobs.update(zip((future for future, *_ in calls), jobs, strict=True))
+        for _ in waiting:
+            self._waiting.popleft()
 
     def _read_reports(self) -> None:
         for file in self._reports.iterdir():
@@ -154,15 +163,6 @@ class Jobs(Executor):
             elif job.done():
                 del self._jobs[future]
                 _settle(future, job)
-
-    def _give_up(self, error: Exception) -> None:
-        """Slurm refuses, or the folder is full: that is the end of all calls."""
-        for future in self._jobs:
-            if not future.cancelled():
-                future.set_exception(PlaceLostError(f"the jobs cannot be followed: {error}"))
-        with suppress(queue.Empty):
-            while True:
-                self._waiting.get_nowait()[0].set_exception(PlaceLostError(f"no job can be submitted: {error}"))
 
 
 def _settle(future: "Future[Any]", job: Any) -> None:

@@ -1,13 +1,13 @@
-"""What results depend on besides their configuration: our sources, and the libraries that calculate."""
+"""Versions that results depend on: our sources, and the libraries that calculate."""
 
 import functools
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 
 from elastic_env.core.errors import ConfigurationError
+from train.runs.folders import installed_version
 
 _ROOT = Path(__file__).parents[2]
 _PHYSICS = ("elastic_env", "baselines", "train/evaluate")
@@ -23,13 +23,13 @@ class VersionsDifferError(ConfigurationError):
 @functools.cache
 def physics() -> dict[str, str]:
     """Versions that the figures of a cell depend on, by name."""
-    return {"sources of the physics": _digest(_PHYSICS), **_installed()}
+    return {"sources of the physics": _digest(_PHYSICS), **_library_versions()}
 
 
 @functools.cache
 def everything() -> dict[str, str]:
     """Versions that all machines of a run must have in common, by name."""
-    return {"sources of elastic-env": _digest(_ALL), **_installed()}
+    return {"sources of elastic-env": _digest(_ALL), **_library_versions()}
 
 
 def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str) -> None:
@@ -47,16 +47,9 @@ def require_same(ours: Mapping[str, str], theirs: Mapping[str, str], where: str)
         )
 
 
-def _installed() -> dict[str, str]:
+def _library_versions() -> dict[str, str]:
     """Python and the libraries that calculate."""
-    return {"python": platform.python_version(), **{name: _version(name) for name in _LIBRARIES}}
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "none"
+    return {"python": platform.python_version(), **{name: installed_version(name) or "none" for name in _LIBRARIES}}
 
 
 def _digest(folders: Sequence[str]) -> str:

@@ -1,11 +1,12 @@
-"""Policies × scenarios × references × seeds under one protocol: one tidy CSV, a summary table, figures."""
+"""`elastic compare`: policies × scenarios × references × seeds under one protocol."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self, cast
 
+import tyro
 from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
@@ -14,6 +15,7 @@ from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Model, Title, lo
 from elastic_env.core.errors import ConfigurationError, SystemFailedError, require_known, shown
 from train.cells.play import CellsFailedError, run_conditions
 from train.cells.store import CELLS, Store
+from train.commands.options import OnHardware
 from train.evaluate.changes import changes, merge_seeds
 from train.evaluate.conditions import MOST_EPISODES, Condition, GivenRanges, GivenReference, PolicySpec, require_drawn
 from train.evaluate.environments import Environment, Reference, environment
@@ -23,7 +25,6 @@ from train.evaluate.maps import MapConfig, heat_maps
 from train.evaluate.robots import robot_scores
 from train.evaluate.rollout import make_policy, single_world_envs
 from train.evaluate.standings import standings
-from train.experiments.timing import step_times
 from train.figures import plots
 from train.figures.comparison_figures import draw_figures, draw_maps
 from train.report import Results, require_jinja2, require_plotly, write_report
@@ -31,11 +32,12 @@ from train.report.change_tables import print_changes, write_maps, write_statisti
 from train.report.leaderboard import print_leaderboard, write_leaderboard
 from train.report.score_tables import print_robots, write_robots
 from train.report.summary import print_summary, write_episodes, write_summary
-from train.runs.folders import describe, locked, require_run, run_folder
+from train.runs.folders import describe, lock_run, require_run, run_folder
 from train.runs.kinds import is_a
 from train.runs.user_code import code_refused, require_no_code
 from train.runs.warned import each_once
-from train.workers.places import HERE, Place
+from train.speed.step_times import step_times
+from train.workers.executors import LOCAL_EXECUTORS, Executors
 
 _MOST_CELLS = 10_000
 
@@ -47,7 +49,7 @@ class Sweep(Model):
     """Option of the policies, such as stiffness_scale."""
     values: list[float] = Field(min_length=2, max_length=MOST_ENTRIES)
     label: Title | None = None
-    """What the axis says; None for the option's name."""
+    """Label of the axis; None for the option's name."""
 
 
 class CompareConfig(Model):
@@ -63,10 +65,12 @@ class CompareConfig(Model):
         default=[PolicySpec(name="uncompensated"), PolicySpec(name="input")], min_length=1, max_length=MOST_ENTRIES
     )
     """Baselines by name, or mappings with name, label, options, and env_options of their own."""
-    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES, description="episodes per cell")
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    """Episodes per cell."""
     scenario_episodes: dict[str, int] = {}
     """Episodes per cell of single scenarios, where they differ: {ideal: 1}, in which nothing is random."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES, description="seed of the first episode")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    """Seed of the first episode."""
     ranges: GivenRanges = {}
     """Intervals that the robots of the scenario `drawn` are drawn from, in place of its own."""
     env_options: dict[str, Any] = {}
@@ -82,7 +86,7 @@ class CompareConfig(Model):
     reference_scenarios: dict[str, list[Title]] = {}
     """Scenarios of single references, by their names in tables, where not all are played: {24 s: [nominal]}."""
     leaderboard: bool = False
-    """Whether a leaderboard is written: policies in tracks, groups and motions as columns, and the time of a step."""
+    """Write a leaderboard: policies in tracks, groups and motions as columns, and the time of a step."""
 
     @model_validator(mode="before")
     @classmethod
@@ -178,9 +182,16 @@ class CompareConfig(Model):
             )
         return [
             Condition(
-                env=self.env, policy=entrant.policy, member=entrant.member, reference=reference, label=label,
-                scenario=scenario, swept=swept, ranges=self.ranges,
-                env_options=self.env_options, episodes=self.scenario_episodes.get(scenario, self.episodes),
+                env=self.env,
+                policy=entrant.policy,
+                member=entrant.member,
+                reference=reference,
+                label=label,
+                scenario=scenario,
+                swept=swept,
+                ranges=self.ranges,
+                env_options=self.env_options,
+                episodes=self.scenario_episodes.get(scenario, self.episodes),
                 seed=self.seed,
             )
             for reference, label, scenarios in zip(
@@ -189,7 +200,7 @@ class CompareConfig(Model):
             for scenario in scenarios
             for entrant in entrants
             for swept in self._swept(entrant.policy)
-        ]  # fmt: skip
+        ]
 
     def _swept(self, policy: PolicySpec) -> list[dict[str, float]]:
         if self.map is not None:
@@ -199,7 +210,7 @@ class CompareConfig(Model):
         return [{self.sweep.option: value} for value in self.sweep.values]
 
     def _reference_names(self) -> list[str]:
-        """What tables call the references."""
+        """Names of the references in tables."""
         known = environment(self.env)
         labels = self._reference_labels()
         return [label or known.label(reference) for label, reference in zip(labels, self.references, strict=True)]
@@ -228,12 +239,12 @@ class Work:
     """How a comparison is played.
 
     Attributes:
-        place: Where its cells are played.
+        executors: Where its cells are played.
         resumes: Whether the output folder is a run that is gone on with.
         fresh: Whether cells that it keeps are played again.
     """
 
-    place: Place = HERE
+    executors: Executors = LOCAL_EXECUTORS
     resumes: bool = False
     fresh: bool = False
 
@@ -265,7 +276,7 @@ def compare(
     conditions = config.conditions(with_bases=report)
     try_out(conditions)
     with _folder(config, output, work) as folder:
-        evaluations = _played(conditions, console, work, folder, keeps=report)
+        evaluations = _play_cells(conditions, console, work, folder, keeps=report)
         files = [write_episodes(evaluations, folder / "episodes.csv")]
         robots = robot_scores(evaluations)
         if robots:
@@ -296,7 +307,7 @@ def compare(
     return Comparison(folder, evaluations, files)
 
 
-def recorded(folder: Path, trust_code: bool = False) -> CompareConfig:
+def recorded_config(folder: Path, trust_code: bool = False) -> CompareConfig:
     """The configuration of a run that is gone on with.
 
     Args:
@@ -321,23 +332,23 @@ def _folder(config: CompareConfig, output: Path | None, work: Work) -> Iterator[
     """The folder of a run, new or gone on with, for this program alone."""
     content = config.model_dump(mode="json")
     if not work.resumes or output is None:
-        with run_folder(config.name, content, config.seed, output) as folder, locked(folder):
+        with run_folder(config.name, content, config.seed, output) as folder, lock_run(folder):
             yield folder
         return
     require_run(output, "run", "compare wrote")
-    with locked(output):
+    with lock_run(output):
         describe(output, content, config.seed)
         yield output
 
 
-def _played(
+def _play_cells(
     conditions: Sequence[Condition], console: Console, work: Work, folder: Path, keeps: bool
 ) -> list[Evaluation]:
     """The cells; what is finished when some fail, or at Ctrl-C, is kept."""
     store = Store(folder / CELLS) if keeps else None
     go_on = f"go on with: elastic compare --resume {folder}"
     try:
-        return run_conditions(conditions, console, work.place, store, work.fresh)
+        return run_conditions(conditions, console, work.executors, store, work.fresh)
     except CellsFailedError as error:
         if error.finished:
             write_summary(merge_seeds(error.finished), folder / "summary.md")
@@ -395,3 +406,70 @@ def _parameters(reference: Reference, known: Environment) -> list[str]:
     if not isinstance(reference, dict):
         return []
     return [f"{name}={value}" for name, value in reference.items() if name not in ("kind", known.motion)]
+
+
+class Compare(Model):
+    """Compare policies × scenarios × references × seeds as a configuration says.
+
+    Writes episodes.csv (one row per episode), statistics.csv (paired changes), report.html (charts and tables, works
+    offline), report.md, summary.md and figures beside the resolved configuration, seed, versions and commit.
+
+    A policy residual:PATH may have a * in its path, such as residual:runs/NAME/seed_*/last: all training seeds of a
+    residual, compared with their base on the same episodes, with intervals over training seeds. The base is added if
+    it is not among the policies. residual:walker_3s/seed_* and the like are the trained ones of the package.
+
+    Example, one joint: elastic compare configs/testbed.yaml
+
+    Example, the paper's walks: elastic compare configs/paper.yaml
+
+    Example, trained residuals: elastic compare configs/learned_testbed.yaml
+
+    Example, all policies in tracks by what they need: elastic compare configs/leaderboard.yaml
+
+    Example, heat maps over two axes: elastic compare configs/map_payload_slope.yaml
+    """
+
+    config: Annotated[Path | None, tyro.conf.Positional] = None
+    """YAML configuration, see configs/; with --resume the one of the run unless another is named."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/<name>, numbered if taken."""
+    jobs: int = 0
+    """Conditions that run at the same time, 0 for one per core; on hardware they come one after the other."""
+    on: str = "local"
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+    resume: Path | None = None
+    """Folder of a run to go on with: what is missing or has changed is played."""
+    fresh: bool = False
+    """With --resume: play all cells again."""
+    trust_code: bool = False
+    """With --resume and no configuration: run the code that the run's own names."""
+    hardware: OnHardware = OnHardware()
+
+    def run(self, console: Console) -> None:
+        """Compare."""
+        self._require()
+        if self.config is not None:
+            config = load_yaml(self.config, CompareConfig)
+        else:
+            config = recorded_config(cast(Path, self.resume), self.trust_code)
+        if self.hardware.arguments:
+            real = self.hardware.environment(config.env)
+            real["env_options"] = {**config.env_options, **real["env_options"]}
+            config = config.replace(scenarios=["hardware"], scenario_episodes={}, groups={}, **real)
+        work = Work(Executors(self.on, self.jobs), self.resume is not None, self.fresh)
+        print_files(compare(config, console, self.resume or self.output, work), console)
+
+    def _require(self) -> None:
+        if self.config is None and self.resume is None:
+            raise ConfigurationError("name a configuration or, with --resume, the run to go on with")
+        if self.resume is not None and self.output is not None:
+            raise ConfigurationError("a run goes on in its own folder: --resume takes no --output")
+        if self.resume is None and self.fresh:
+            raise ConfigurationError("--fresh needs --resume; a new run plays all of its cells")
+
+
+def print_files(comparison: Comparison, console: Console) -> None:
+    """Say what a comparison wrote."""
+    console.print(f"Results in {comparison.folder}:", soft_wrap=True)
+    for path in comparison.files:
+        console.print(f"  {path}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Watch a policy: a window, or a video file."""
+"""`elastic play`: one episode in a window, or as a video file."""
 
 import io
 import time
@@ -12,8 +12,11 @@ import gymnasium
 from rich.console import Console
 from rich.progress import track
 
+from elastic_env.core.config import LARGEST_SEED, Model, quantity
 from elastic_env.core.errors import ElasticError, ResultsExistError, SystemFailedError, missing_extra, shortened
-from train.evaluate.conditions import Condition
+from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, name_options, reference_of
+from train.evaluate.conditions import MOST_EPISODES, Condition, PolicySpec
+from train.evaluate.environments import environment
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
 _FRAMES_PER_S = 25
@@ -34,7 +37,7 @@ def play(condition: Condition, console: Console, video: Path | None = None, max_
     """
     env: Any = gymnasium.make(
         condition.environment.id, render_mode="human" if video is None else "rgb_array", **condition.arguments
-    )  # fmt: skip
+    )
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     with closing(env):
@@ -109,7 +112,9 @@ def _film(env: Any, episode: Iterator[int], steps: int, period: float, video: Pa
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
     video.parent.mkdir(parents=True, exist_ok=True)
     writer: Any
-    frame_s, frames, gif = every * period, 0, io.BytesIO()
+    frame_s = every * period
+    frames = 0
+    gif = io.BytesIO()
     is_gif = video.suffix == ".gif"
     timing: dict[str, Any] = {"duration": 1e3 * frame_s} if is_gif else {"fps": 1.0 / frame_s}
     # a GIF is made in memory in any case, and its writer would print what a full disk makes it raise
@@ -143,3 +148,52 @@ def _require_whole(video: Path, frames: int) -> None:
             f"{video} is not whole, {found} of {frames} frames can be read; the disk may be full: free some space, "
             "then play again"
         )
+
+
+class WatchedEpisode(Model):
+    """Options of an episode that somebody watches."""
+
+    policy: str = "uncompensated"
+    """Baseline, residual:PATH, or "FILE.py:function" for one's own; see elastic evaluate --help."""
+    env: str = "testbed"
+    """Environment: testbed, walker, robot, ROBOT.yaml (a file of any robot, see docs/robots.md),
+    or "FILE.py:ROBOT", a JointRobot."""
+    scenario: str = DEFAULT_SCENARIO
+    """Scenario."""
+    reference: MotionOrDefault = None
+    """MotionOrDefault, as in elastic evaluate; default sine, on the walker 3."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    """Seed of the episode."""
+    max_s: float | None = None
+    """Stop after this much simulated time [s]."""
+
+    @property
+    def condition(self) -> Condition:
+        """The cell that is played."""
+        watched = environment(self.env).watched_reference if self.reference is None else None
+        with name_options():
+            return Condition(
+                env=self.env,
+                policy=PolicySpec(name=self.policy),
+                scenario=self.scenario,
+                seed=self.seed,
+                reference=reference_of(self.env, self.reference) if watched is None else watched,
+            )
+
+
+class Play(WatchedEpisode):
+    """Watch one episode: in a window in real time, or with --video as a file.
+
+    Deviations from the reference are drawn enlarged, by a factor that the picture shows.
+
+    Example, one joint: elastic play --policy input --reference sine --video sine.mp4
+
+    Example, a walk: elastic play --env walker --policy input_output --video walk.mp4
+    """
+
+    video: Path | None = None
+    """Video file to write (.mp4, .gif); without it a window opens."""
+
+    def run(self, console: Console) -> None:
+        """Play."""
+        play(self.condition, console, self.video, self.max_s)

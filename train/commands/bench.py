@@ -2,16 +2,17 @@
 
 import json
 import os
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 import yaml
 from pydantic import Field, model_validator
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from elastic_env.core.config import LARGEST_SEED, MOST_ENTRIES, Locator, Model, Title, load_yaml, quantity
@@ -21,6 +22,7 @@ from train.cells.play import run_conditions
 from train.evaluate.conditions import Condition, GivenReference, PolicySpec
 from train.evaluate.environments import environment
 from train.evaluate.episodes import Evaluation
+from train.runs.console import make_table
 from train.runs.escaping import markdown_table
 from train.runs.folders import run_folder
 from train.runs.kinds import is_a
@@ -39,7 +41,8 @@ class BenchCase(Model):
     scenario: Title = "nominal"
     reference: GivenReference | None = None
     """Motion, as in a comparison; None for the environment's default."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2, description="seed of the episode")
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
+    """Seed of the episode."""
     figures: dict[str, float | None] = Field(min_length=1, max_length=MOST_ENTRIES)
     """Metrics of the episode with what was accepted; null where `--update` has not measured yet."""
 
@@ -55,9 +58,8 @@ class BenchConfig(Model):
     """The rollouts of `elastic bench`."""
 
     name: Title = "bench"
-    margin: float = quantity(
-        "1", 0.05, ge=0, le=100, description="relative amount by which a figure may exceed the accepted"
-    )
+    margin: float = quantity("1", 0.05, ge=0, le=100)
+    """Relative amount by which a figure may exceed the accepted."""
     _kind = model_validator(mode="before")(is_a("bench"))
     cases: list[BenchCase] = Field(min_length=1, max_length=MOST_ENTRIES)
 
@@ -170,13 +172,14 @@ def _accept(path: Path, config: BenchConfig, evaluations: list[Evaluation]) -> N
             if metric in episode and not episode["termination"]:
                 changes.append((figures[metric], f"{episode[metric]:.4g}"))
     for node, value in sorted(changes, key=lambda change: -change[0].start_mark.index):
-        begin, end = node.start_mark.index, node.end_mark.index
+        begin = node.start_mark.index
+        end = node.end_mark.index
         text = text[:begin] + (value if end > begin else f" {value}") + text[end:]
     write_whole(path.resolve(), text)  # the user named it, maybe by a link
 
 
 def _figure_nodes(text: str) -> list[dict[str, yaml.Node]]:
-    """Where the figures of every case stand in a configuration, by metric."""
+    """Nodes of the figures of every case in a configuration, by metric."""
     cases = _child(yaml.compose(text), "cases")
     return [{key.value: value for key, value in _child(case, "figures").value} for case in cases.value]
 
@@ -205,18 +208,39 @@ _COLUMNS = ("rollout", "figure", "measured", "accepted", "at most", "")
 
 
 def _table(figures: list[Figure]) -> Table:
-    table = Table(title="short rollouts against what was accepted", box=box.SIMPLE)
-    for name in ("rollout and figure", "measured", "at most", ""):
-        table.add_column(name, justify="right" if name in ("measured", "at most") else "left")
+    rows = []
     last = ""
     for case, metric, measured, _, bound, verdict in _rows(figures):
         if case != last:
-            table.add_row(escape(case), "", "", "")
-        table.add_row(escape(f"  {metric}"), measured, bound, verdict)
+            rows.append((case, "", "", ""))
+        rows.append((f"  {metric}", measured, bound, verdict))
         last = case
+    head = ["rollout and figure", "measured", "at most", ""]
+    table = make_table("short rollouts against what was accepted", head, rows, box=box.SIMPLE)
+    table.columns[-1].justify = "left"
     return table
 
 
 def _markdown(figures: list[Figure]) -> str:
     rules = ["---", "---", "---:", "---:", "---:", "---"]
     return f"## elastic bench\n\n{markdown_table(_COLUMNS, rules, _rows(figures))}\n"
+
+
+class Bench(Model):
+    """Guard figures in CI: short rollouts of both environments against what was accepted.
+
+    Exit code 1, and a line for every figure that falls short. Appends its table to the file that $GITHUB_STEP_SUMMARY
+    names. Example, to accept new figures: elastic bench --update
+    """
+
+    config: Annotated[Path, tyro.conf.Positional] = USUAL
+    """Configuration with rollouts and accepted figures; where there is no configs/bench.yaml, that of the package."""
+    update: bool = False
+    """Accept what is measured now: the figures in the configuration change, and nothing else of it."""
+    output: Path | None = None
+    """Folder for bench.json and bench.md, new or empty; default runs/bench, numbered if taken."""
+
+    def run(self, console: Console) -> None:
+        """Play and compare."""
+        if not bench(configuration(self.config, self.update), console, self.update, self.output):
+            sys.exit(1)

@@ -6,13 +6,13 @@ Its folder holds the robot's file, a comparison with report, a picture, and the 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 from pydantic import Field
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from baselines import PositionCompensator
@@ -28,13 +28,15 @@ from elastic_env.rendering.sag import ENLARGED, SagViews
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import RobotConfig, configure_robot
 from elastic_env.runtime.joint_task import JointPlant
-from train.evaluate.conditions import Condition, GivenReference, PolicySpec
+from train.commands.compare import CompareConfig, compare
+from train.commands.options import Motion, StiffnessOrFile
+from train.commands.play import play
+from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation
 from train.evaluate.robot_file import ENDINGS, read_robot_file
-from train.experiments.compare import CompareConfig, compare
-from train.experiments.play import play
 from train.figures import plots
 from train.report import require_jinja2, require_plotly
+from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 
@@ -42,23 +44,51 @@ SCENARIO = "nominal"
 """The robot as its joints are described, friction and encoders included; `ideal` would leave these out."""
 POLICIES = ("uncompensated", "input", "dynamic")
 _TIP = "tip"
-_PIXELS, _POSES_SHOWN = 420, 2
+_STYLE: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
+_PIXELS = 420
+_POSES_SHOWN = 2
 
 
-class RobotTrial(Model):
-    """What `elastic robot` does."""
+class Robot(Model):
+    """Try a robot of your own: make its joints elastic, play it with and without compensation, and say what it gains.
 
-    model: Locator
-    """File of MJCF or URDF, a file of a robot (.yaml), or a name of the gallery."""
-    stiffness: Locator | float | None = None
-    """File of the elastic joints, or one K of all hinges [N·m/rad]."""
+    Plays static poses and a motion with the policies uncompensated, input and dynamic, in the scenario nominal: with
+    friction and encoders as the joints file has them. Prints the error of the end effector [mm], and how much of it
+    comes from each joint. The folder has robot.yaml (for --env of the other commands), joints.yaml, picture.png,
+    end_effector.csv, joints.csv, and a comparison with report.html.
+
+    Example: elastic robot arm.urdf --stiffness joints.yaml --end-effector tool0
+
+    Example, one K for all hinges: elastic robot arm.xml --stiffness 1000
+
+    Example, an arm of the gallery (extra robots): elastic robot panda
+    """
+
+    model: Annotated[Locator, tyro.conf.Positional]
+    """File of MJCF (.xml) or URDF (.urdf) of a robot on a fixed base, ROBOT.yaml (a file of a robot, see
+    docs/robots.md), or a name of the gallery, such as panda, ur5, xarm7, so101."""
+    stiffness: StiffnessOrFile = None
+    """YAML file of the elastic joints, or one K of all hinges [N·m/rad]. Has no default, as K is a property of your
+    robot; elastic identify --robot finds it. K of the gallery is assumed."""
     end_effector: Locator | None = None
-    """Site or body that is placed."""
-    poses: Poses = Poses(positions=4)
+    """Site or body that is to be placed; default that of the robot's file or of the gallery, or the outermost body."""
+    poses: Annotated[Poses, tyro.conf.Suppress] = Poses(positions=4)
     """Static poses; fewer than an environment plays, for a result within a minute."""
-    motion: GivenReference = Field(default={"kind": "moves", "positions": 4})
-    """Motion that is played beside the static poses."""
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the episodes")
+    motion: Motion = Field(default={"kind": "moves", "positions": 4})
+    """Motion beside the static poses: moves, line, circle, sine, multisine, or a mapping of kind and parameters."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED)
+    """Seed of the episodes."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/robot, numbered if taken."""
+    video: bool = False
+    """Film the motion, uncompensated and with input. Off by default: a second of motion is 50 frames to draw."""
+
+    def run(self, console: Console) -> None:
+        """Play, write, print."""
+        result = try_robot(self, console)
+        console.print(f"Results in {result.folder}:", soft_wrap=True)
+        for path in result.files:
+            console.print(f"  {path}", soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -80,7 +110,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class JointShare:
-    """What a joint adds to the error of the end effector at rest, uncompensated and without friction.
+    """Share of a joint in the error of the end effector at rest, uncompensated and without friction.
 
     Attributes:
         joint: Its name.
@@ -105,7 +135,7 @@ class JointShare:
 
 @dataclass(frozen=True)
 class RobotResult:
-    """What came out, and its files."""
+    """Results of the trial, and its files."""
 
     folder: Path
     placed: list[Placed]
@@ -113,14 +143,12 @@ class RobotResult:
     files: list[Path]
 
 
-def try_robot(trial: RobotTrial, console: Console, output: Path | None = None, video: bool = False) -> RobotResult:
+def try_robot(trial: Robot, console: Console) -> RobotResult:
     """Make a robot elastic, play it with every policy, write its folder, and print its tables.
 
     Args:
         trial: The robot and its motion.
         console: Where progress and tables go.
-        output: Folder for the results; default runs/robot, numbered if taken.
-        video: Whether the motion is filmed, without and with `input`.
 
     Raises:
         ConfigurationError: The model, its joints or the motion cannot be used; found before a folder is made.
@@ -139,24 +167,26 @@ def try_robot(trial: RobotTrial, console: Console, output: Path | None = None, v
     plant = config.robot.plant(config)
     if trial.stiffness is None and trial.model in GALLERY:
         console.print(f"K of {trial.model} is assumed, as nobody publishes it; name yours by --stiffness")
-    with run_folder("robot", trial.model_dump(mode="json"), trial.seed, output) as folder:
+    recorded = trial.model_dump(mode="json", exclude={"output", "video"})
+    with run_folder("robot", recorded, trial.seed, trial.output) as folder:
         file = write_robot(arguments, folder)
         comparison = compare(_comparison(trial, file), console, folder / "comparison")
-        placed, shares = [_placed(one) for one in comparison.evaluations], joint_shares(plant)
+        placed = [_placement(one) for one in comparison.evaluations]
+        shares = joint_shares(plant)
         files = [
             file,
             comparison.folder / "report.html",
             write_records([asdict(one) for one in placed], folder / "end_effector.csv"),
             write_records([asdict(one) for one in shares], folder / "joints.csv"),
             *_pictures(config, plant, folder, console),
-            *(_films(trial, file, folder, console) if video else []),
+            *(_films(trial, file, folder, console) if trial.video else []),
         ]
     for table in (_placed_table(placed), _shares_table(shares)):
         console.print(table)
     return RobotResult(folder, placed, shares, files)
 
 
-def robot_arguments(trial: RobotTrial) -> dict[str, Any]:
+def robot_arguments(trial: Robot) -> dict[str, Any]:
     """Arguments of `elastic_env/Robot-v0`, without reference and scenario.
 
     Raises:
@@ -188,10 +218,12 @@ def _of_model(name: str) -> dict[str, Any]:
 def _of_gallery(name: str) -> dict[str, Any]:
     """A robot of the gallery with its assumed joints. Its own file, if nothing has to be changed in it."""
     known = GALLERY[name]
-    file, end_effector = gallery_file(name), known.end_effector
+    file = gallery_file(name)
+    end_effector = known.end_effector
     model = str(file)
     if file.suffix != ".urdf" or any(known.tip):
-        spec, end_effector = gallery_robot(name, shapes=True), _TIP
+        spec = gallery_robot(name, shapes=True)
+        end_effector = _TIP
         spec.body(known.end_effector).add_site(name=_TIP, pos=known.tip)
         spec.compile()
         model = spec.to_xml()
@@ -229,7 +261,9 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
     Returns:
         The robot's file, for `--env`.
     """
-    written, model, joints = dict(arguments), arguments["model"], arguments["joints"]
+    written = dict(arguments)
+    model = arguments["model"]
+    joints = arguments["joints"]
     if is_text(model):
         (folder / "model.xml").write_text(without_declaration(model), encoding="utf-8")
         written["model"] = "model.xml"
@@ -242,23 +276,29 @@ def write_robot(arguments: Mapping[str, Any], folder: Path) -> Path:
     return folder / "robot.yaml"
 
 
-def _comparison(trial: RobotTrial, file: Path) -> CompareConfig:
+def _comparison(trial: Robot, file: Path) -> CompareConfig:
     references = [trial.poses.model_dump(mode="json"), trial.motion]
     return CompareConfig(
-        name="robot", env=str(file), references=references, scenarios=[SCENARIO],
-        policies=[PolicySpec(name=name) for name in POLICIES], seed=trial.seed,
-    )  # fmt: skip
+        name="robot",
+        env=str(file),
+        references=references,
+        scenarios=[SCENARIO],
+        policies=[PolicySpec(name=name) for name in POLICIES],
+        seed=trial.seed,
+    )
 
 
-def _placed(evaluation: Evaluation) -> Placed:
+def _placement(evaluation: Evaluation) -> Placed:
     def only(metric: str) -> float:
         values = evaluation.values(metric)
         return float(values[0]) if len(values) else float("nan")
 
     return Placed(
-        evaluation.condition.reference_name, evaluation.condition.policy.title,
-        only("end_effector_error_rms_m"), only("end_effector_error_peak_m"),
-    )  # fmt: skip
+        evaluation.condition.reference_name,
+        evaluation.condition.policy.title,
+        only("end_effector_error_rms_m"),
+        only("end_effector_error_peak_m"),
+    )
 
 
 def rest_poses(plant: JointPlant) -> Array:
@@ -268,7 +308,7 @@ def rest_poses(plant: JointPlant) -> Array:
 
 
 def joint_shares(plant: JointPlant) -> list[JointShare]:
-    r"""Where the error of the end effector at rest comes from, in closed form.
+    r"""Shares of the joints in the error of the end effector at rest, in closed form.
 
     Nothing is played: a link rests where spring and weight balance, K(θ − q) = τ_g(q), with θ = q_ref. With column
     J_j of the end effector's Jacobian the error is, to first order, the sum over the joints
@@ -284,7 +324,8 @@ def joint_shares(plant: JointPlant) -> list[JointShare]:
     assert tool is not None
     q_ref = rest_poses(plant)
     q = plant.rest_angle(q_ref)
-    parts, torque = tool.parts(q_ref, q), plant.static_torque(q)
+    parts = tool.parts(q_ref, q)
+    torque = plant.static_torque(q)
     error = parts.sum(axis=-1)
     shares = np.einsum("pi,pij->j", error, parts) / max(float(np.sum(error**2)), np.finfo(np.float64).tiny)
     lever = np.linalg.norm(tool.jacobian(q_ref)[0], axis=1)
@@ -292,9 +333,16 @@ def joint_shares(plant: JointPlant) -> list[JointShare]:
     with np.errstate(divide="ignore"):
         position_gain = 1.0 / plant.true.servo_compliance
     columns = zip(
-        plant.joint_names, plant.true.stiffness, position_gain, _rms(torque), _rms(q - q_ref),
-        _rms(np.linalg.norm(parts, axis=1)), shares, _rms(friction), strict=True,
-    )  # fmt: skip
+        plant.joint_names,
+        plant.true.stiffness,
+        position_gain,
+        _rms(torque),
+        _rms(q - q_ref),
+        _rms(np.linalg.norm(parts, axis=1)),
+        shares,
+        _rms(friction),
+        strict=True,
+    )
     return [JointShare(name, *map(float, values)) for name, *values in columns]
 
 
@@ -332,7 +380,8 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
     compensator = PositionCompensator(known.rigid, in_series, joints=known.joint_names)
     q_ref = rest_poses(plant)
     order = np.argsort(-tool.errors(q_ref, plant.rest_angle(q_ref))[0])[:_POSES_SHOWN]
-    views, rows = SagViews(config.robot.rigid(), plant.joint_names, _PIXELS), []
+    views = SagViews(config.robot.rigid(), plant.joint_names, _PIXELS)
+    rows = []
     for wanted in q_ref[order]:
         twice = np.array([wanted, wanted])
         links = plant.rest_angle(np.array([wanted, compensator.command(wanted)]))
@@ -345,7 +394,7 @@ def picture(config: RobotConfig, plant: JointPlant) -> Image:
     return np.concatenate(rows)
 
 
-def _films(trial: RobotTrial, file: Path, folder: Path, console: Console) -> list[Path]:
+def _films(trial: Robot, file: Path, folder: Path, console: Console) -> list[Path]:
     """The motion without and with `input`."""
     films = []
     for policy in POLICIES[:2]:
@@ -358,42 +407,33 @@ def _films(trial: RobotTrial, file: Path, folder: Path, console: Console) -> lis
 
 
 def _placed_table(placed: Sequence[Placed]) -> Table:
-    table = Table(title="end effector, rms error \\[mm]", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("motion")
-    for policy in POLICIES:
-        table.add_column(policy, justify="right")
-    table.add_column("left by the best", justify="right")
+    rows = []
     for motion in dict.fromkeys(one.motion for one in placed):
         errors = [1e3 * one.error_rms_m for one in placed if one.motion == motion]
         best = min((error for error in errors[1:] if not np.isnan(error)), default=np.nan)
         left = best / errors[0] if errors[0] > 0.0 else np.nan
-        shown_errors = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
-        table.add_row(escape(motion), *shown_errors, "-" if np.isnan(left) else f"{100.0 * left:.1f} %")
-    return table
+        cells = ["failed" if np.isnan(error) else f"{error:.3f}" for error in errors]
+        rows.append([motion, *cells, "-" if np.isnan(left) else f"{100.0 * left:.1f} %"])
+    return make_table("end effector, rms error [mm]", ["motion", *POLICIES, "left by the best"], rows, **_STYLE)
 
 
 def _shares_table(shares: Sequence[JointShare]) -> Table:
-    caption = "closed form, uncompensated: springs and servos that give way; F/K is what friction can leave"
-    table = Table(
-        title="where the error at rest comes from", caption=caption, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    table.add_column("joint")
     gives_way = any(np.isfinite(one.position_gain_Nm_per_rad) for one in shares)
-    for name in (
-        "K\nNm/rad",
-        *["k_p\nNm/rad"] * gives_way,
-        "torque\nNm",
-        "deflection\nmrad",
-        "alone\nmm",
-        "share\n%",
-        "F/K\nmm",
-    ):
-        table.add_column(name, justify="right", vertical="bottom")
-    for one in shares:
-        table.add_row(
-            escape(one.joint), f"{one.stiffness_Nm_per_rad:.4g}",
-            *[f"{one.position_gain_Nm_per_rad:.4g}"] * gives_way, f"{one.gravity_torque_rms_Nm:.2f}",
-            f"{1e3 * one.deflection_rms_rad:.2f}", f"{1e3 * one.end_effector_rms_m:.2f}",
-            f"{100.0 * one.share:.1f}", f"{1e3 * one.friction_leaves_m:.2f}",
-        )  # fmt: skip
+    columns = {
+        "joint": [one.joint for one in shares],
+        "K\nNm/rad": [f"{one.stiffness_Nm_per_rad:.4g}" for one in shares],
+        "k_p\nNm/rad": [f"{one.position_gain_Nm_per_rad:.4g}" for one in shares],
+        "torque\nNm": [f"{one.gravity_torque_rms_Nm:.2f}" for one in shares],
+        "deflection\nmrad": [f"{1e3 * one.deflection_rms_rad:.2f}" for one in shares],
+        "alone\nmm": [f"{1e3 * one.end_effector_rms_m:.2f}" for one in shares],
+        "share\n%": [f"{100.0 * one.share:.1f}" for one in shares],
+        "F/K\nmm": [f"{1e3 * one.friction_leaves_m:.2f}" for one in shares],
+    }
+    if not gives_way:
+        del columns["k_p\nNm/rad"]
+    caption = "closed form, uncompensated: springs and servos that give way; F/K is what friction can leave"
+    rows = zip(*columns.values(), strict=True)
+    table = make_table("where the error at rest comes from", list(columns), rows, caption=caption, **_STYLE)
+    for column in table.columns[1:]:
+        column.vertical = "bottom"
     return table

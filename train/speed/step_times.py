@@ -9,7 +9,8 @@ from typing import Any
 from train.evaluate.conditions import Condition
 from train.evaluate.rollout import control_steps, make_policy, make_vector_env
 
-_STEPS, _ROUNDS = 50, 15
+_STEPS = 50
+_ROUNDS = 15
 """Control steps per round: whole decisions of residuals, which take 25; rounds, of which the median counts."""
 
 

@@ -91,7 +91,7 @@ class Head:
         """All values of a header."""
         return [value for other, value in self.headers if other.lower() == name.lower()]
 
-    def encoded(self) -> bytes:
+    def encode(self) -> bytes:
         """As it is sent."""
         lines = [self.line, *(f"{name}: {value}" for name, value in self.headers)]
         return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")
@@ -128,7 +128,7 @@ class Access:
 
     @property
     def address(self) -> str:
-        """What a browser opens."""
+        """Address that a browser opens."""
         name = socket.gethostname() if self._is_everywhere else self.host
         name = f"[{name}]" if ":" in name else name
         return f"http://{name}:{self.port}/?{_TOKEN}={self.token}"
@@ -140,7 +140,7 @@ class Access:
 
     @property
     def is_local(self) -> bool:
-        """Whether only programs of this machine reach the page."""
+        """True if only programs of this machine reach the page."""
         return _is_loopback(self.host)
 
     @property
@@ -306,9 +306,9 @@ class Proxy:
     ) -> None:
         viewer_reader, viewer_writer = await asyncio.open_unix_connection(self._viewer, limit=_LARGEST_HEAD)
         try:
-            viewer_writer.write(_for_viewer(request, asked).encoded())
+            viewer_writer.write(_for_viewer(request, asked).encode())
             answer = Head.parse(await viewer_reader.readuntil(b"\r\n\r\n"))
-            writer.write(self._for_browser(answer, asked).encoded())
+            writer.write(self._for_browser(answer, asked).encode())
             ways: list[Coroutine[Any, Any, None]] = [_copy(viewer_reader, writer)]
             if asked.is_socket:
                 ways.append(_copy(reader, viewer_writer))
@@ -344,14 +344,14 @@ def _for_viewer(request: Head, asked: Asked) -> Head:
 
 
 def _opens_page(name: str) -> bool:
-    """Whether a header of the viewer lets other pages read an answer."""
+    """True if a header of the viewer lets other pages read an answer."""
     return name.lower().startswith("access-control-") or name.lower() == "cross-origin-resource-policy"
 
 
 def _refusal(reason: str) -> bytes:
     body = f"403: {reason}\n".encode()
     headers = [("Content-Type", "text/plain; charset=utf-8"), ("Content-Length", str(len(body)))]
-    return Head("HTTP/1.1 403 Forbidden", [*headers, ("Connection", "close"), *_PRIVATE]).encoded() + body
+    return Head("HTTP/1.1 403 Forbidden", [*headers, ("Connection", "close"), *_PRIVATE]).encode() + body
 
 
 async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:

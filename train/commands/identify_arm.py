@@ -4,14 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Self
 
 import mujoco
 import numpy as np
-from pydantic import model_validator
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from baselines.identification.arm_fit import (
@@ -35,12 +32,13 @@ from baselines.identification.pose_plan import (
     plan_poses,
 )
 from baselines.identification.static_arm import StaticArm
-from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantity
+from elastic_env.core.config import Locator, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.joint.known_torque import commanded_hinges, hinges_of
 from elastic_env.joint.model_file import compiled_model, from_mujoco
 from train.figures import plots
 from train.figures.arm_plots import draw_arm_identification
+from train.runs.console import make_table
 from train.runs.folders import run_folder
 from train.runs.progress import show_progress
 
@@ -48,60 +46,57 @@ _ASSUMED_DEFLECTION_RAD = 0.01
 """Deflection under the largest gravity torque that a plan without a log assumes."""
 
 
-class IdentifyArmConfig(Model):
-    """What `elastic identify --robot` does."""
+class ArmOptions(Model):
+    """Options of `elastic identify` for an arm of which there is a log of static poses."""
 
-    robot: Locator
-    """Rigid model of the arm, MJCF or URDF."""
+    robot: Locator | None = None
+    """Rigid model of an arm, MJCF or URDF, in place of the testbed; the options from here on are of an arm."""
     log: Locator | None = None
-    """CSV file of static poses; None to plan the first ones."""
+    """CSV file of static poses: motor encoders, and link encoders, end-effector positions, an IMU or joint torques."""
     joints: tuple[Title, ...] = ()
-    """Names or patterns of the joints whose stiffness is sought; empty for all in the log."""
+    """Names or patterns of the joints whose stiffness is sought; default all in the log. The others are rigid."""
     end_effector: Title | None = None
-    """Site or body that is measured; None for the outermost body."""
+    """Site or body whose position is measured or that carries the IMU; default the outermost body."""
     payload: Title | None = None
-    """Body or site that carries a payload of unknown mass."""
+    """Body or site that carries a payload of unknown mass, which is estimated too."""
     frame: Frame = "offset"
-    """What is known of the measurement's frame."""
+    """Frame of tracker or IMU: known, unknown by an offset, or in pose; for an IMU the last two mean its mounting."""
     measured_by: Kind | None = None
-    """Measurement to use."""
-    within: float = quantity("1", 0.03, gt=0, lt=1, description="half-width of 1/K up to which a joint is told apart")
-    assume: float | None = quantity("N·m/rad", None, gt=0, description="K of joints whose interval reaches to rigid")
-    plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED, description="number of poses to propose")
-    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED, description="seed of the poses from which the plan chooses")
-
-    @model_validator(mode="after")
-    def _something_to_do(self) -> Self:
-        if self.log is None and (not self.plan or self.measured_by is None):
-            raise ValueError(
-                "give the CSV file of static poses by --log, or plan the first poses by --plan 40 --measured-by "
-                "end_effector (or link_encoders, imu, torques)"
-            )
-        return self
+    """Measurement to use, where the log has several or there is no log."""
+    within: float = quantity("1", 0.03, gt=0, lt=1)
+    """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this share."""
+    assume: float | None = quantity("N·m/rad", None, gt=0)
+    """K [N·m/rad] to write for joints that the poses do not tell; default the largest that was identified."""
+    plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED)
+    """Propose so many further poses, within limits and without contacts, that tell the stiffness best."""
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """An arm, its log, and the joints that are sought."""
+    """An arm, its log, the joints that are sought, and how."""
 
+    options: ArmOptions
     arm: StaticArm
     log: PoseLog
     elastic: tuple[str, ...]
+    seed: int
 
-    def model(self, config: IdentifyArmConfig, log: PoseLog | None = None) -> PoseModel:
+    def model(self, log: PoseLog | None = None) -> PoseModel:
         """The poses of a log as a function of the unknowns."""
         own = self.log if log is None else log
-        return PoseModel(self.arm, own, Unknowns.of(own, self.elastic, config.frame, config.payload is not None))
+        has_payload = self.options.payload is not None
+        return PoseModel(self.arm, own, Unknowns.of(own, self.elastic, self.options.frame, has_payload))
 
 
 def run_arm_identification(
-    config: IdentifyArmConfig, console: Console, output: Path | None = None
+    options: ArmOptions, console: Console, seed: int = 0, output: Path | None = None
 ) -> ArmIdentification | None:
     """Identify an arm, write `identification.json`, `joints.yaml` and the figure, print the result; or plan.
 
     Args:
-        config: What to do.
+        options: What to do.
         console: Where progress and table go.
+        seed: Seed of the poses from which the plan chooses.
         output: Folder for the results; default runs/identify, numbered if taken.
 
     Returns:
@@ -111,45 +106,60 @@ def run_arm_identification(
         ConfigurationError: Model, log or a name cannot be used.
         ResultsExistError: The output folder holds results.
     """
+    if options.robot is None:
+        raise ConfigurationError("--robot is missing; name the arm's model, a file of MJCF (.xml) or URDF (.urdf)")
+    if options.log is None and (not options.plan or options.measured_by is None):
+        raise ConfigurationError(
+            "give the CSV file of static poses by --log, or plan the first poses by --plan 40 --measured-by "
+            "end_effector (or link_encoders, imu, torques)"
+        )
     plots.require_matplotlib()
-    setting = _setting(config, compiled_model(config.robot), console)
-    with run_folder("identify", config.model_dump(mode="json"), config.seed, output) as folder:
-        if config.log is None:
-            _plan_first(config, setting, folder, console)
+    setting = _setting(options, compiled_model(options.robot), console, seed)
+    recorded = {**options.model_dump(mode="json"), "seed": seed}
+    with run_folder("identify", recorded, seed, output) as folder:
+        if options.log is None:
+            _plan_first(setting, folder, console)
             return None
         with show_progress(console, {"fitting, steps": USUAL_EVALUATIONS}, transient=True) as show:
-            fit = fit_arm(setting.model(config), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
-        plan = plan_further(fit, _candidates(config, setting, console), config.plan) if config.plan else None
-        result = described(fit, config.within, config.assume, None if plan is None else plan.information)
+            fit = fit_arm(setting.model(), lambda done: show(0, min(done, USUAL_EVALUATIONS)))
+        plan = plan_further(fit, _candidates(setting, console), options.plan) if options.plan else None
+        information = None if plan is None else plan.information
+        result = described(fit, options.within, options.assume, information)
         files = result.save(folder)
         files.append(draw_arm_identification(fit, result, folder / "identification.png"))
         files += [] if plan is None else [_write_plan(setting.arm, plan, folder / "plan.csv")]
     console.print(result_table(result))
     for line in [summed_up(fit), *remarks(result)]:
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False)
     for path in files:
-        console.print(f"wrote {path}", soft_wrap=True, markup=False)
+        console.print(f"wrote {path}", soft_wrap=True)
     return result
 
 
 def result_table(result: ArmIdentification) -> Table:
     """An identification as a table."""
-    has_friction, has_plan = not result.friction_is_noise, result.joints[0].planned_half_width is not None
+    has_friction = not result.friction_is_noise
+    has_plan = result.joints[0].planned_half_width is not None
     title = f"K [N·m/rad] from {result.poses} poses, by {result.measurement.replace('_', ' ')}"
-    table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0))
-    table.add_column("joint", no_wrap=True)
-    heads = ["K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction]
-    for head in [*heads, "o [mrad]"]:
-        table.add_column(escape(head), justify="right", no_wrap=True)
-    for joint in result.joints:
-        cells = [*_stiffness_cells(joint), *[_percent(joint.planned_half_width)] * has_plan]
-        cells += [_number(joint.friction_nm)] * has_friction + [_number(joint.offset_rad, 1e3)]
-        table.add_row(escape(joint.joint), *cells)
+    head = ["joint", "K", "95 % interval", "±", *["planned ±"] * has_plan, *["F [N·m]"] * has_friction, "o [mrad]"]
+    rows = [
+        [
+            joint.joint,
+            *_stiffness_cells(joint),
+            *[_percent(joint.planned_half_width)] * has_plan,
+            *[_number(joint.friction_nm)] * has_friction,
+            _number(joint.offset_rad, 1e3),
+        ]
+        for joint in result.joints
+    ]
+    table = make_table(title, head, rows, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    for column in table.columns:
+        column.no_wrap = True
     return table
 
 
 def remarks(result: ArmIdentification) -> list[str]:
-    """What the table does not say: the payload, joints that are not told apart, and poses that do not fit."""
+    """Remarks beside the table: the payload, joints that are not told apart, and poses that do not fit."""
     lines = []
     if result.payload_half_width_kg is not None:
         lines.append(_payload_line(result.payload_kg, result.payload_half_width_kg))
@@ -211,12 +221,12 @@ def _beyond_any_plan(joints: Sequence[JointStiffness]) -> list[str]:
     ]
 
 
-def _candidates(config: IdentifyArmConfig, setting: _Setting, console: Console) -> PoseLog:
+def _candidates(setting: _Setting, console: Console) -> PoseLog:
     """Poses to choose from; says where contacts of the arm are not known."""
-    shapes = shaped_model(config.robot)
+    shapes = shaped_model(str(setting.options.robot))
     if not (shapes.geom_contype.any() or shapes.geom_conaffinity.any()):
         console.print("the model has no shapes that MuJoCo can read: check the proposed poses for contacts yourself")
-    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(config.seed))
+    return candidate_poses(setting.arm, shapes, setting.log, np.random.default_rng(setting.seed))
 
 
 def shaped_model(path: str) -> mujoco.MjModel:
@@ -229,21 +239,21 @@ def shaped_model(path: str) -> mujoco.MjModel:
     return shaped if set(hinges_of(plain)) <= set(hinges_of(shaped)) else plain
 
 
-def _setting(config: IdentifyArmConfig, model: mujoco.MjModel, console: Console) -> _Setting:
+def _setting(options: ArmOptions, model: mujoco.MjModel, console: Console, seed: int) -> _Setting:
     """Read the log, and look everything up that is named."""
     hinges = hinges_of(model)
     ranges = {name: _range(model, name) for name in hinges}
-    log = None if config.log is None else read_log(Path(config.log), ranges, config.measured_by)
+    log = None if options.log is None else read_log(Path(options.log), ranges, options.measured_by)
     joints = commanded_hinges(model) if log is None else log.joints
-    arm = StaticArm(model, joints, config.end_effector, config.payload)
+    arm = StaticArm(model, joints, options.end_effector, options.payload)
     arm.require_gravity()
     if log is None:
-        log = empty_log(arm, config.measured_by or "end_effector")
-    if config.end_effector is None and log.kind in ("end_effector", "imu"):
+        log = empty_log(arm, options.measured_by or "end_effector")
+    if options.end_effector is None and log.kind in ("end_effector", "imu"):
         console.print(f"measured is taken to be {arm.end_effector!r}; --end-effector names another site or body")
-    setting = _Setting(arm, log, _sought(config.joints, log.joints))
-    if config.log is not None:
-        require_poses(setting.model(config))
+    setting = _Setting(options, arm, log, _elastic_joints(options.joints, log.joints), seed)
+    if options.log is not None:
+        require_poses(setting.model())
     return setting
 
 
@@ -252,7 +262,7 @@ def _range(model: mujoco.MjModel, joint: str) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
+def _elastic_joints(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     """Joints that a name or pattern fits, in the order of the log."""
     for pattern in patterns:
         if not any(fnmatchcase(joint, pattern) for joint in joints):
@@ -260,26 +270,23 @@ def _sought(patterns: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(joint for joint in joints if not patterns or any(fnmatchcase(joint, p) for p in patterns))
 
 
-def _plan_first(config: IdentifyArmConfig, setting: _Setting, folder: Path, console: Console) -> None:
+def _plan_first(setting: _Setting, folder: Path, console: Console) -> None:
     """Plan without a log: with usual noise, and deflections of a usual size."""
-    candidates = _candidates(config, setting, console)
-    model, noise = setting.model(config, candidates), USUAL_NOISE[setting.log.kind]
+    candidates = _candidates(setting, console)
+    model = setting.model(candidates)
+    noise = USUAL_NOISE[setting.log.kind]
     start = model.start_with(_ASSUMED_DEFLECTION_RAD)
-    plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, config.plan)
+    plan = plan_poses(model, start, noise, np.eye(len(start)), candidates, setting.options.plan)
     own = model.unknowns.slices["compliance"]
     half = 1.96 * np.sqrt(np.diag(np.linalg.inv(plan.information))[own]) * model.scale[own] / start[own]
-    table = Table(title=f"{len(plan.theta)} proposed poses")
-    table.add_column("joint")
-    table.add_column("expected ± of K", justify="right")
-    for joint, width in zip(setting.elastic, half, strict=True):
-        table.add_row(escape(joint), _percent(float(width)))
-    console.print(table)
+    rows = [(joint, _percent(float(width))) for joint, width in zip(setting.elastic, half, strict=True)]
+    console.print(make_table(f"{len(plan.theta)} proposed poses", ["joint", "expected ± of K"], rows))
     console.print(
         f"expected for noise of {in_unit(noise, setting.log.kind)} and {1e3 * _ASSUMED_DEFLECTION_RAD:g} mrad of "
         "deflection under the largest gravity torque of each joint; half the deflection doubles it",
         highlight=False,
     )
-    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True, markup=False)
+    console.print(f"wrote {_write_plan(setting.arm, plan, folder / 'plan.csv')}", soft_wrap=True)
 
 
 def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
@@ -290,7 +297,8 @@ def _write_plan(arm: StaticArm, plan: PosePlan, path: Path) -> Path:
 
 
 def _stiffness_cells(joint: JointStiffness) -> list[str]:
-    low, high = joint.stiffness_low_nm_per_rad, joint.stiffness_high_nm_per_rad
+    low = joint.stiffness_low_nm_per_rad
+    high = joint.stiffness_high_nm_per_rad
     if low is None or high is None:
         return ["–", "–", _percent(joint.half_width)]
     return [f"{joint.stiffness_nm_per_rad:.4g}", f"{low:.4g} to {high:.4g}", _percent(joint.half_width)]

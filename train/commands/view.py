@@ -1,4 +1,4 @@
-"""An episode in MuJoCo's web viewer: reference, motor side and link side, side by side."""
+"""`elastic view`: an episode in MuJoCo's web viewer: reference, motor side and link side, side by side."""
 
 import bisect
 import contextlib
@@ -22,12 +22,13 @@ from rich.console import Console
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.rendering.side_by_side import Alone, SideBySide, Sides
+from train.commands.play import WatchedEpisode, episode, steps_within
+from train.commands.view_proxy import LOOPBACK, Access, Proxy, listen
 from train.evaluate.conditions import Condition
 from train.evaluate.rollout import make_policy
-from train.experiments.play import episode, steps_within
-from train.experiments.view_proxy import LOOPBACK, Access, Proxy, listen
 
-FIRST_FACTOR, LARGEST_FACTOR = 3.0, 20.0
+FIRST_FACTOR = 3.0
+LARGEST_FACTOR = 20.0
 """Factors of the slider: the one at the start, and its end."""
 
 _FRAMES_PER_S = 50
@@ -35,7 +36,8 @@ _PAUSE_S = 0.01
 _SHORT = "/tmp"
 """Where a socket is: its path may have about a hundred characters, and TMPDIR may be longer."""
 _TITLE = "elastic view: reference, motor side, link side"
-_PLACE, _SIZE = (16.0, 40.0), (400.0, 130.0)
+_PLACE = (16.0, 40.0)
+_SIZE = (400.0, 130.0)
 """Of the window of sliders [pixels]."""
 
 
@@ -60,7 +62,7 @@ class Recording:
 
 @dataclass
 class Playback:
-    """What the sliders of the page set and the drawing reads: time [s], factor, and whether time stands still."""
+    """State of the page, which sliders set and the drawing reads: time [s], factor, and whether time stands still."""
 
     recording: Recording
     time_s: float = 0.0
@@ -70,7 +72,8 @@ class Playback:
 
     def tick(self) -> None:
         """Go on by the time that has passed, from the end back to the start."""
-        now, last = time.monotonic(), self._last_s
+        now = time.monotonic()
+        last = self._last_s
         self._last_s = now
         if not self.paused:
             end = self.recording.times_s[-1]
@@ -92,7 +95,8 @@ def record(condition: Condition, console: Console, max_s: float | None = None) -
     task = env.unwrapped.task
     period = task.assumed_model.control_period_s
     every = max(round(1.0 / (_FRAMES_PER_S * period)), 1)
-    times_s, frames = [], []
+    times_s = []
+    frames = []
     with contextlib.closing(env):
         steps = steps_within(task, max_s)
         picture = env.unwrapped.picture
@@ -111,7 +115,8 @@ class _Poses(plugin.SimPlugin):
     """Takes the place of the physics: poses the three robots."""
 
     def __init__(self, playback: Playback, scene: SideBySide) -> None:
-        self._playback, self._scene = playback, scene
+        self._playback = playback
+        self._scene = scene
 
     @messages.handler
     def _on_load_model(self, _: messages.LoadModelEvent) -> bool:
@@ -215,7 +220,8 @@ def show(recording: Recording, host: str = LOOPBACK, port: int = 0) -> Iterator[
 
 def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
     """Start the viewer in a thread; it listens on a Unix socket of a path."""
-    scene, playback = SideBySide(recording.robot), Playback(recording)
+    scene = SideBySide(recording.robot)
+    playback = Playback(recording)
     plugins = [
         app.App(app.Config(show_options=False, show_inspector=False)),
         _Poses(playback, scene),
@@ -240,37 +246,40 @@ def _launch(recording: Recording, place: str) -> viewer_handle.ViewerHandle:
     return handle
 
 
-@dataclass(frozen=True)
-class PageOptions:
-    """Where and how long a page shows an episode.
+class View(WatchedEpisode):
+    """Look at one episode in the browser: reference, motor side and link side of the robot, side by side.
 
-    Attributes:
-        host: Address or name of this machine at which it listens.
-        port: Its port; 0 takes the first free one from 8080 on.
-        max_s: How much of the episode it shows [s]; None for all.
+    The episode is played first, then shown again and again by MuJoCo's web viewer until Ctrl-C. Sliders set the time,
+    and the factor by which deviations from the reference are enlarged. The page is reached from this machine alone, at
+    the address that is printed, with its token; from elsewhere by: ssh -L 8080:127.0.0.1:8080 MACHINE
+
+    Example, one joint: elastic view --policy input --reference sine
+
+    Example, a walk: elastic view --env walker --policy input_output --scenario soft
     """
 
     host: str = LOOPBACK
+    """Address or name of this machine at which the page listens; 0.0.0.0 for all, then others reach it too."""
     port: int = 0
-    max_s: float | None = None
+    """Port of the page; 0 takes the first free one from 8080 on."""
 
-
-def view(condition: Condition, console: Console, options: PageOptions) -> None:
-    """Play an episode, then show it until Ctrl-C."""
-    listen(options.host, options.port).close()  # what cannot be is said before the episode
-    console.print(f"playing {condition.policy.title} first", soft_wrap=True)
-    recording = record(condition, console, options.max_s)
-    with show(recording, options.host, options.port) as page:
-        console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False, markup=False)
-        if not page.access.is_local:
-            console.print(
-                "who has this address sees the page and moves its sliders; nothing on the way is encrypted",
-                soft_wrap=True,
-            )
-        console.print("Ctrl-C ends it", soft_wrap=True)
-        _open_tab(page.access.address)
-        while page.handle.is_running():
-            page.handle.sync()
+    def run(self, console: Console) -> None:
+        """Play an episode, then show it until Ctrl-C."""
+        listen(self.host, self.port).close()  # what cannot be is said before the episode
+        condition = self.condition
+        console.print(f"playing {self.policy} first", soft_wrap=True)
+        recording = record(condition, console, self.max_s)
+        with show(recording, self.host, self.port) as page:
+            console.print(f"the page is at {page.access.address}", soft_wrap=True, highlight=False)
+            if not page.access.is_local:
+                console.print(
+                    "who has this address sees the page and moves its sliders; nothing on the way is encrypted",
+                    soft_wrap=True,
+                )
+            console.print("Ctrl-C ends it", soft_wrap=True)
+            _open_tab(page.access.address)
+            while page.handle.is_running():
+                page.handle.sync()
 
 
 def _open_tab(address: str) -> None:

@@ -1,7 +1,7 @@
 """Every residual of the package trained anew from its configuration, and compared with the one of the package.
 
     make residuals                                       # or, for some of them:
-    python -m train.experiments.residuals testbed walker_3s_posture --seeds 0 1 --jobs 2
+    python -m train.commands.residuals testbed walker_3s_posture --seeds 0 1 --jobs 2
 
 Training and comparison of each are runs in runs/residuals. A call goes on where the last one was interrupted.
 """
@@ -15,12 +15,12 @@ from rich.console import Console
 
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
+from train.commands.compare import CompareConfig, Comparison, Work, compare
 from train.evaluate.conditions import PolicySpec
-from train.experiments.compare import CompareConfig, Comparison, Work, compare
 from train.learn.run_training import resume, start
 from train.learn.train_config import TrainConfig
 from train.runs.folders import CONFIG, RUNS
-from train.workers.places import Place
+from train.workers.executors import Executors
 
 RESIDUALS = {
     "testbed": "learned_testbed",
@@ -65,7 +65,7 @@ def beside_the_shipped(config: CompareConfig, name: str, trained: Path) -> Compa
 
 
 def reproduce(
-    name: str, folder: Path, console: Console, seeds: Sequence[int], place: Place, configs: Path = CONFIGS
+    name: str, folder: Path, console: Console, seeds: Sequence[int], executors: Executors, configs: Path = CONFIGS
 ) -> Comparison:
     """Train a residual of the package anew, and compare it with that of the package.
 
@@ -74,17 +74,18 @@ def reproduce(
         folder: For both runs.
         console: Where progress and tables go.
         seeds: Training seeds.
-        place: Where training seeds and cells run, and how many at a time.
+        executors: Where training seeds and cells run, and how many at a time.
         configs: Folder of both configurations.
     """
-    training, comparison = folder / name / "training", folder / name / "comparison"
+    training = folder / name / "training"
+    comparison = folder / name / "comparison"
     config = load_yaml(configs / f"train_{name}.yaml", TrainConfig).replace(seeds=list(seeds))
     if (training / CONFIG).is_file():
-        resume([training], console, place)
+        resume([training], console, executors)
     else:
-        start([config], console, training, place)
+        start([config], console, training, executors)
     compared = load_yaml(configs / f"{RESIDUALS[name]}.yaml", CompareConfig)
-    work = Work(place, resumes=(comparison / CONFIG).is_file())
+    work = Work(executors, resumes=(comparison / CONFIG).is_file())
     return compare(beside_the_shipped(compared, name, training), console, comparison, work)
 
 
@@ -105,7 +106,7 @@ def main(
     try:
         require_known("residual of the package", names, RESIDUALS)
         for name in names or RESIDUALS:
-            reproduce(name, output, Console(), seeds or shipped_seeds(name), Place(jobs=jobs))
+            reproduce(name, output, Console(), seeds or shipped_seeds(name), Executors(jobs=jobs))
     except ElasticError as error:
         raise SystemExit(f"error: {error}") from None
 

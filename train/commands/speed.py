@@ -1,7 +1,8 @@
-"""Throughput in one interleaved run: our vector environment against raw `mj_step`, scalar environments, and PPO."""
+"""`elastic speed`: our vector environment against raw `mj_step`, scalar environments and PPO, in one run."""
 
 import cProfile
 import importlib
+import io
 import json
 import os
 import pstats
@@ -9,7 +10,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 from rich.console import Console
@@ -17,6 +18,7 @@ from rich.table import Table
 
 from elastic_env.core.config import Model, quantity
 from train.evaluate.environments import environment
+from train.runs.console import make_table
 from train.runs.escaping import write_records
 from train.runs.folders import run_folder
 from train.runs.progress import plain_progress
@@ -29,28 +31,68 @@ from train.speed.contenders import (
     ScalarLoop,
     VectorLoop,
 )
+from train.speed.real_time import measure_real_time
 
 _PPO_PROCESSES = 2
 
 
-class SpeedConfig(Model):
-    """What `elastic speed` measures."""
+class Speed(Model):
+    """Measure throughput against raw mj_step on the same model, in one interleaved run.
+
+    Timed are the vector environment, without and with a policy and a residual network in its loop; scalar environments,
+    under the vector environments of Gymnasium and SB3 too; and PPO end to end.
+
+    Example, the vector environment alone: elastic speed --env testbed --num-envs 64 1024 --no-others --no-ppo
+
+    With --real-time one policy is timed alone, as on a robot: it is called with recorded observations, once in every
+    control period. Printed are late cycles and latencies. Example: elastic speed --real-time --policy dynamic
+    """
 
     env: str = "walker"
+    """Environment: testbed or walker."""
     policy: str | None = None
-    """Policy in the loop of the vector environment, which is timed without, with it, and with a residual network; None
-    for input_wrench on the walker, input on the testbed."""
-    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field(default=[64, 256], min_length=1, max_length=100)
+    """Baseline in the loop, or "FILE.py:function"; default input_wrench on the walker, input on the testbed; with
+    --real-time adaptive_posture on the walker."""
+    num_envs: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field([64, 256], min_length=1, max_length=100)
     """Numbers of worlds."""
     others: bool = True
-    """Whether scalar environments are timed too, alone and under Gymnasium's and SB3's vector environments."""
-    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field(default=[2, 4], min_length=1, max_length=100)
-    """Numbers of processes to try with them; the fastest counts."""
+    """Time scalar environments too, alone and in vector environments of Gymnasium and SB3."""
+    processes: list[Annotated[int, Field(ge=1, le=1024)]] = Field([2, 4], min_length=1, max_length=100)
+    """Numbers of processes to try with them."""
     ppo: bool = True
-    """Whether PPO is timed end to end, with ours and with processes."""
-    steps: int = quantity("1", 50, ge=1, le=100_000, description="control steps per round")
-    rounds: int = quantity("1", 7, ge=1, le=1000, description="rounds, of which medians are reported")
-    threads: int = quantity("1", 0, ge=0, le=1024, description="threads of the physics, 0 for all cores")
+    """Time PPO end to end too."""
+    profile: bool = False
+    """Say where the time of the vector environment with its policy goes."""
+    steps: int = quantity("1", 50, ge=1, le=100_000)
+    """Control steps per round."""
+    rounds: int = quantity("1", 7, ge=1, le=1000)
+    """Rounds; medians are reported."""
+    threads: int = quantity("1", 0, ge=0, le=1024)
+    """Threads of both contenders, 0 for all cores."""
+    real_time: bool = False
+    """Time a policy alone against the clock, in place of all that; reads env, policy, seconds and output alone."""
+    seconds: float = quantity("s", 60.0, gt=0, le=86_400)
+    """How long, with --real-time [s]."""
+    output: Path | None = None
+    """Folder for speed.json and speed.csv, or real_time.json, new or empty; default runs/speed, numbered if taken."""
+
+    @property
+    def threads_used(self) -> int:
+        """Threads, one per core for 0."""
+        return self.threads or os.cpu_count() or 1
+
+    @property
+    def looped_policy(self) -> str:
+        """The policy in the loop: the named one, or the environment's best that needs no truth."""
+        return self.policy or environment(self.env).looped_policy
+
+    def run(self, console: Console) -> None:
+        """Measure and report."""
+        if self.real_time:
+            path = measure_real_time(self.env, self.policy, self.seconds, console, self.output)
+        else:
+            path = measure_all(self, console)
+        console.print(f"wrote {path}", soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -84,7 +126,7 @@ class _Entry:
     against: int
 
 
-def measure(config: SpeedConfig, progress: Callable[[float], None] | None = None) -> list[SpeedResult]:
+def measure(config: Speed, progress: Callable[[float], None] | None = None) -> list[SpeedResult]:
     """Time all contenders in turn, round by round; the first round warms up.
 
     Args:
@@ -108,10 +150,11 @@ def measure(config: SpeedConfig, progress: Callable[[float], None] | None = None
     return [_result(config, entries, rates, number) for number in range(len(entries))]
 
 
-def _entries(config: SpeedConfig) -> list[_Entry]:
-    """What is timed, every reference before or right after what is compared with it."""
-    threads, env = config.threads or os.cpu_count() or 1, config.env
-    policy = _policy(config)
+def _entries(config: Speed) -> list[_Entry]:
+    """Everything that is timed, every reference before or right after what is compared with it."""
+    threads = config.threads_used
+    env = config.env
+    policy = config.looped_policy
     entries: list[_Entry] = []
     for n in config.num_envs:
         loop = VectorLoop(env, n, min(threads, n))
@@ -121,7 +164,8 @@ def _entries(config: SpeedConfig) -> list[_Entry]:
         entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy), raw))
         entries.append(_Entry(VectorLoop(env, n, min(threads, n), policy, residual=True), raw))
     if config.others:
-        scalar, raw = ScalarLoop(env), len(entries) + 1
+        scalar = ScalarLoop(env)
+        raw = len(entries) + 1
         entries += [_Entry(scalar, raw), _Entry(RawWorlds(scalar, 1), raw)]
         for count in config.processes:
             entries.append(_Entry(GymnasiumLoop(env, "async", count), 0))
@@ -135,49 +179,42 @@ def _entries(config: SpeedConfig) -> list[_Entry]:
     return entries
 
 
-def _policy(config: SpeedConfig) -> str:
-    """The policy in the loop: the one that is asked for, or the environment's best that needs no truth."""
-    return config.policy or environment(config.env).looped_policy
-
-
-def _result(config: SpeedConfig, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:
-    entry, reference = entries[number], entries[entries[number].against]
-    mine, others = rates[number][1:], rates[entry.against][1:]
+def _result(config: Speed, entries: Sequence[_Entry], rates: list[list[float]], number: int) -> SpeedResult:
+    entry = entries[number]
+    reference = entries[entries[number].against]
+    mine = rates[number][1:]
+    others = rates[entry.against][1:]
     return SpeedResult(
         env=config.env,
         contender=entry.contender.title,
         num_envs=entry.contender.num_envs,
-        threads=config.threads or os.cpu_count() or 1,
+        threads=config.threads_used,
         steps_per_s=statistics.median(mine),
         ratio=statistics.median(a / b for a, b in zip(mine, others, strict=True)),
         against=f"{reference.contender.title}, {reference.contender.num_envs}",
     )
 
 
-def profile(config: SpeedConfig) -> str:
-    """Where the time of the vector environment with its policy goes, as text."""
-    threads, n = config.threads or os.cpu_count() or 1, config.num_envs[0]
-    loop = VectorLoop(config.env, n, min(threads, n), _policy(config))
+def profile(config: Speed) -> str:
+    """Profile of the vector environment with its policy, as text."""
+    n = config.num_envs[0]
+    loop = VectorLoop(config.env, n, min(config.threads_used, n), config.looped_policy)
     loop.run(config.steps)
     profiler = cProfile.Profile()
     profiler.enable()
     loop.run(config.steps * config.rounds)
     profiler.disable()
-    import io
-
     text = io.StringIO()
     pstats.Stats(profiler, stream=text).strip_dirs().sort_stats("cumulative").print_stats(40)
     return text.getvalue()
 
 
-def measure_all(config: SpeedConfig, console: Console, output: Path | None = None, with_profile: bool = False) -> Path:
+def measure_all(config: Speed, console: Console) -> Path:
     """Measure, print the ratios, and write them as JSON and CSV.
 
     Args:
         config: What to measure.
         console: Where progress and table go.
-        output: Folder for the results; default runs/speed, numbered if taken.
-        with_profile: Whether to print where the time goes, and keep it beside.
 
     Returns:
         The file.
@@ -190,13 +227,14 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
     if config.others or config.ppo:
         importlib.import_module("stable_baselines3")
     VectorLoop(config.env, 1, 1, config.policy)
-    with run_folder("speed", config.model_dump(mode="json"), None, output) as folder:
+    recorded = config.model_dump(mode="json", exclude={"output", "profile", "real_time", "seconds"})
+    with run_folder("speed", recorded, None, config.output) as folder:
         console.print("measuring every contender in turn, round by round")
         results = measure(config, plain_progress(console))
         path = folder / "speed.json"
         path.write_text(json.dumps([asdict(r) for r in results], indent=2) + "\n")
         write_records([asdict(r) for r in results], folder / "speed.csv")
-        if with_profile:
+        if config.profile:
             text = profile(config)
             (folder / "profile.txt").write_text(text)
             console.print(text, highlight=False, markup=False)
@@ -204,11 +242,9 @@ def measure_all(config: SpeedConfig, console: Console, output: Path | None = Non
     return path
 
 
-def _table(config: SpeedConfig, results: Sequence[SpeedResult]) -> Table:
-    table = Table(title=f"{config.env}: control steps per second, medians of one interleaved run")
-    for name, justify in (("", "left"), ("worlds", "right"), ("steps/s", "right"), ("ratio", "right"), ("to", "left")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for r in results:
-        row: tuple[Any, ...] = (r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against)
-        table.add_row(*row)
+def _table(config: Speed, results: Sequence[SpeedResult]) -> Table:
+    title = f"{config.env}: control steps per second, medians of one interleaved run"
+    rows = [(r.contender, str(r.num_envs), f"{r.steps_per_s:,.0f}", f"{r.ratio:.3f}", r.against) for r in results]
+    table = make_table(title, ["", "worlds", "steps/s", "ratio", "to"], rows)
+    table.columns[-1].justify = "left"
     return table

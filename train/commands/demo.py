@@ -1,0 +1,150 @@
+"""`elastic demo`: the paper's identification, compensation, a motion and walks (Figs. 5 to 10) in short."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import baselines.identification.identify as identification
+from baselines.compensation.gravity_torque import make_gravity
+from elastic_env.core.config import Model
+from train.cells.play import run_conditions
+from train.commands.compare import CompareConfig
+from train.evaluate.conditions import PolicySpec
+from train.evaluate.episodes import Evaluation
+from train.evaluate.rollout import make_vector_env
+from train.figures import plots
+from train.figures.comparison_figures import cells_together, draw_figure, draw_time_series
+from train.figures.testbed_plots import draw_identification, draw_static_errors, static_errors
+from train.report.summary import print_summary, write_episodes, write_summary
+from train.runs.console import make_table
+from train.runs.folders import run_folder
+
+PAPER_PELVIS = {"uncompensated": "about 40", "input_output": "below 10"}
+"""Angle error of the pelvis that the paper reports in both gaits [mrad], its Figs. 7 and 8."""
+
+_STATIC = CompareConfig(
+    name="demo",
+    references=["hold"],
+    policies=[PolicySpec(name="uncompensated"), PolicySpec(name="input")],
+)
+_MOTION = CompareConfig(
+    name="demo",
+    references=["sine"],
+    policies=[
+        *(PolicySpec(name=name) for name in ("uncompensated", "input", "dynamic", "oracle")),
+        PolicySpec(name="residual:testbed/seed_0", label="residual"),
+    ],
+)
+_SLOW_WALK = CompareConfig(
+    name="demo",
+    env="walker",
+    references=[{"step_period": 24, "num_steps": 2}],
+    policies=[PolicySpec(name=name) for name in ("uncompensated", "input_output")],
+)
+_WALK = CompareConfig(
+    name="demo",
+    env="walker",
+    references=[3],
+    policies=[PolicySpec(name=name) for name in ("uncompensated", "input_output", "input_wrench")],
+)
+_SOFT_WALK = CompareConfig(  # where the model is right, a residual leaves its base alone
+    name="demo",
+    env="walker",
+    references=[3],
+    scenarios=["soft"],
+    policies=[
+        PolicySpec(name="input_output"),
+        PolicySpec(name="residual:walker_3s/seed_0", label="residual"),
+    ],
+)
+
+
+class Demo(Model):
+    """The paper's experiments in short, on testbed and walker, in some minutes, with pictures."""
+
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/demo, numbered if taken."""
+
+    def run(self, console: Console) -> None:
+        """Run, print the tables beside the paper's figures, and say where the pictures are."""
+        plots.require_matplotlib()
+        walking = [*_SLOW_WALK.conditions(), *_WALK.conditions(), *_SOFT_WALK.conditions()]
+        parts = [_STATIC.conditions(), _MOTION.conditions(), walking]
+        conditions = [condition for part in parts for condition in part]
+        recorded = {"conditions": [condition.model_dump(mode="json") for condition in conditions]}
+        with run_folder("demo", recorded, 0, self.output) as folder:
+            console.print(
+                "Robots of the paper, simulated (scenario nominal): one joint with servo, elastic gear and a "
+                "pendulum of 60 N·m, and a humanoid that walks in place on twelve of them; at the end with joints "
+                "that are softer than assumed (scenario soft)"
+            )
+            evaluations = iter(run_conditions(conditions, console))
+            static, motion, walks = ([next(evaluations) for _ in part] for part in parts)
+            model = make_vector_env(static[0].condition, 1).unwrapped.assumed_model
+            points = static[0].points
+            assert points is not None
+            result = identification.identify_points(points, [make_gravity(model)])
+            result.save(folder / "identification.json")
+            files = [
+                draw_identification(result, points, [model], folder / "fig5_identification.png"),
+                draw_static_errors(static, model, folder / "fig6_static_errors.png"),
+                draw_time_series(motion, folder / "sine.png"),
+                *(
+                    file
+                    for name in ("pelvis", "zmp")
+                    for walk in cells_together(walks)
+                    for file in draw_figure(name, walk, folder)
+                ),
+                folder / "identification.json",
+                write_episodes([*motion, *walks], folder / "episodes.csv"),
+                write_summary([*motion, *walks], folder / "summary.md"),
+            ]
+        console.print(_testbed_table(result, static), "")
+        print_summary(motion, console)
+        console.print("", _walk_table(walks), "")
+        print_summary(walks, console)
+        console.print("Figures and data:")
+        for path in files:
+            console.print(f"  {path}", soft_wrap=True)
+
+
+_HEAD = ("quantity", "here", "paper")
+
+
+def _testbed_table(result: identification.Identification, static: Sequence[Evaluation]) -> Table:
+    low = result.stiffness_low_nm_per_rad
+    high = result.stiffness_high_nm_per_rad
+    rows = [
+        ("true stiffness of the plant [N·m/rad]", "1001", "-"),
+        ("identified stiffness [N·m/rad]", f"{result.stiffness_nm_per_rad:.1f}", "1001"),
+        ("  95 % interval", f"{low:.1f} to {high:.1f}", "-"),
+        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f}", "1001"),
+        ("friction [N·m]", f"{result.friction_nm:.2f}", "-"),
+        ("Pearson r", f"{result.pearson_r:.4f}", "0.9775"),
+    ]
+    for evaluation, paper in zip(static, ("-56.2 to +41.7", "-3.7 to +7.1"), strict=True):
+        error = 1e3 * static_errors(evaluation)
+        name = f"link error at rest, {evaluation.condition.policy.title} [mrad]"
+        rows.append((name, f"{error.min():+.1f} to {error.max():+.1f}", paper))
+    return make_table("the paper's testbed experiments, Figs. 5 and 6", _HEAD, rows)
+
+
+def _walk_table(walks: Sequence[Evaluation]) -> Table:
+    rows = []
+    for walk in walks:
+        condition = walk.condition
+        is_paper = condition.scenario == "nominal"
+        scenario = "" if is_paper else f", {condition.scenario}"
+        walked = condition.environment.title(condition.reference_name) + scenario
+        paper = PAPER_PELVIS.get(condition.policy.title, "-") if is_paper else "-"
+        name = f"{walked}, {condition.policy.title} [mrad]"
+        rows.append((name, "fell" if walk.num_failed else _pelvis_peaks(walk), paper))
+    return make_table("the paper's walks, Figs. 7 and 8: largest roll and pitch", _HEAD, rows)
+
+
+def _pelvis_peaks(walk: Evaluation) -> str:
+    roll, pitch = (1e3 * np.max(walk.values(f"pelvis_{axis}_peak_rad")) for axis in ("roll", "pitch"))
+    return f"{roll:.1f} and {pitch:.1f}"

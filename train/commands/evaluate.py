@@ -1,0 +1,66 @@
+"""`elastic evaluate`: episodes of one policy under one scenario."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from elastic_env.core.config import LARGEST_SEED, Model, quantity
+from train.commands.compare import CompareConfig, compare, print_files
+from train.commands.options import MotionOrDefault, OnHardware, Stiffness, name_options, reference_of
+from train.evaluate.conditions import MOST_EPISODES, PolicySpec
+
+
+class Evaluate(Model):
+    """Play episodes of one policy under one scenario and print its metrics.
+
+    Example, one joint: elastic evaluate --policy input --scenario soft --reference multisine --episodes 10
+
+    Example, a walk: elastic evaluate --env walker --policy input_wrench --reference 3
+    """
+
+    policy: str = "input"
+    """Baseline, residual:PATH, or "FILE.py:function" or "module:function" for one's own.
+    Baselines (see Policies in the docs) are
+    zero, uncompensated, input, dynamic, link_encoder,
+    iterative, oracle; on a fixed base also friction,
+    disturbance_observer; on the walker also
+    uncompensated_open, input_open, input_output,
+    input_wrench, adaptive, posture, adaptive_posture,
+    torque_sensor, hip_sensor, thormang, talos."""
+    env: str = "testbed"
+    """Environment: testbed (one joint; with --port a real one), walker (a humanoid that walks in place),
+    robot, ROBOT.yaml (a file of any robot, see docs/robots.md), or "FILE.py:ROBOT", a JointRobot."""
+    scenario: str | None = None
+    """Scenario, such as nominal (default), ideal, soft, stiff, spread, payload, backlash,
+    sensor, ideal+soft; on the walker also imu, push, slope, drawn, drawn_beyond."""
+    reference: MotionOrDefault = None
+    """MotionOrDefault. Testbed: hold (default; takes 20 to 60 s), sine, multisine, steps (some seconds),
+    or a mapping such as '{kind: sine, amplitude: 0.3}'.
+    Walker: step period 24, 3 (default), 1.6 or 1.1 [s],
+    or its durations of double, single, double support '[0.8, 0.6, 0.8]',
+    or a mapping such as '{step_period: 3, num_steps: 2}'."""
+    episodes: int = quantity("1", 1, ge=1, le=MOST_EPISODES)
+    """Number of episodes, seeds following --seed."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - MOST_EPISODES)
+    """Seed of the first episode."""
+    stiffness: Stiffness = None
+    """K that the policy assumes: a number [N·m/rad], a list of one per joint
+    such as '[1001]', twelve on the walker, or the path of an identification.json."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/evaluate, numbered if taken."""
+    on: OnHardware = OnHardware()
+
+    def run(self, console: Console) -> None:
+        """Play a comparison of one cell."""
+        options = {} if self.stiffness is None else {"stiffness": self.stiffness}
+        with name_options():
+            config = CompareConfig(
+                name="evaluate",
+                references=[reference_of(self.env, self.reference)],
+                scenarios=[self.on.scenario(self.scenario)],
+                policies=[PolicySpec(name=self.policy, options=options)],
+                episodes=self.episodes,
+                seed=self.seed,
+                **self.on.environment(self.env),
+            )
+        print_files(compare(config, console, self.output, report=False), console)

@@ -1,0 +1,37 @@
+"""`elastic export`: a model of Stable-Baselines3 as a residual folder."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from elastic_env.core.config import Model, load_yaml
+from train.learn.export import export_zip
+from train.learn.train_config import TrainConfig
+from train.runs.folders import own_folder
+
+
+class Export(Model):
+    """Turn a model that Stable-Baselines3 saved into a residual folder, which plays without torch and runs no code.
+
+    Example: elastic export model.zip configs/train_walker_3s.yaml --normaliser normaliser.pkl --trust-pickle
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """Zip of model.save()."""
+    config: Annotated[Path, tyro.conf.Positional]
+    """Configuration of its training: algorithm, base, settings."""
+    normaliser: Path | None = None
+    """File of VecNormalize.save(); leave it out where observations were not normalised."""
+    trust_pickle: bool = False
+    """SB3 keeps models as pickles: loading one runs code from it."""
+    output: Path | None = None
+    """Folder for the residual, new or empty; default runs/<name of the zip>, numbered if taken."""
+
+    def run(self, console: Console) -> None:
+        """Export."""
+        config = load_yaml(self.config, TrainConfig)
+        with own_folder(self.model.stem, self.output) as folder:
+            export_zip(self.model, config, folder, self.normaliser, self.trust_pickle)
+        console.print(f"play it as residual:{folder}", soft_wrap=True)

@@ -1,0 +1,196 @@
+"""`elastic identify`: the static experiment of the testbed, its files and its table."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import gymnasium
+import numpy as np
+import tyro
+from pydantic import model_validator
+from rich.console import Console
+from rich.table import Table
+
+import elastic_env  # noqa: F401  registers the environments
+from baselines.identification.arm_result import ArmIdentification
+from baselines.identification.identify import Identification, identify
+from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.robots.testbed.model import Pendulum
+from train.commands.identify_arm import ArmOptions, run_arm_identification
+from train.commands.options import OnHardware, option_name
+from train.figures import plots
+from train.figures.testbed_plots import draw_identification
+from train.runs.console import make_table
+from train.runs.escaping import write_records
+from train.runs.folders import run_folder
+from train.runs.progress import plain_progress, show_progress
+
+
+class Identify(Model):
+    """Find the stiffness of the joint from static positions (Fig. 5 of the paper).
+
+    Drives the testbed to its positions from both sides, averages encoder and IMU at rest, and separates stiffness,
+    friction, dead band and offset. Writes identification.json, which the environment and the compensators take as their
+    K, and a figure. Example: elastic identify --scenario backlash
+
+    On a real joint: elastic identify --port /dev/ttyUSB0 --imu-port /dev/ttyACM0
+
+    An arm from a log of static poses, with joints.yaml for compensator and environment, see docs/identification.md:
+    elastic identify --robot arm.urdf --log poses.csv --end-effector tool0 --plan 20
+    """
+
+    scenario: Title | None = None
+    """Scenario of the simulated testbed, such as nominal (default), ideal, backlash, ideal+soft."""
+    stiffness: float | None = quantity("N·m/rad", None, gt=0)
+    """True K of the simulated joint [N·m/rad]; default the paper's 1001."""
+    second_mass: float | None = quantity("1", None, gt=0)
+    """Repeat with the pendulum's mass times this factor, which separates an IMU error ~ sin q from K; such as 0.5."""
+    positions: int = quantity("1", 20, ge=5, le=200)
+    """Number of static positions, at least 5; on a real joint 5 take three minutes, 20 take five."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED // 2)
+    """Seed of the sensor noise."""
+    repeats: int = quantity("1", 1, ge=1, le=10_000)
+    """Repeat with so many seeds and say how often the interval holds the true stiffness."""
+    output: Path | None = None
+    """Folder for the results, new or empty; default runs/identify, numbered if taken."""
+    on: OnHardware = OnHardware()
+    arm: Annotated[ArmOptions, tyro.conf.arg(name="")] = ArmOptions()
+
+    @model_validator(mode="after")
+    def _masses_differ(self) -> Self:
+        if self.second_mass == 1.0:
+            raise ValueError("second_mass must differ from 1: two equal masses do not separate anything")
+        return self
+
+    def run(self, console: Console) -> list[Identification] | ArmIdentification | None:
+        """Identify the testbed, simulated or real, or an arm; write `identification.json` and the figure.
+
+        Returns:
+            One result per repetition; of an arm its result, or None for a plan without a log.
+
+        Raises:
+            ConfigurationError: A name does not exist, or an option does not go with another.
+            ResultsExistError: The output folder holds results.
+        """
+        if self.arm == ArmOptions():
+            return self._identify_testbed(console)
+        given = {"seed": self.seed, "output": self.output}
+        if others := [name for name, value in Identify(**given, arm=self.arm) if value != getattr(self, name)]:
+            names = ", ".join("--port and the like" if name == "on" else option_name((name,)) for name in others)
+            raise ConfigurationError(f"options of the testbed: {names}; leave them out beside --robot and --log")
+        return run_arm_identification(self.arm, console, **given)
+
+    def _identify_testbed(self, console: Console) -> list[Identification]:
+        plots.require_matplotlib()
+        scenario = self.on.scenario(self.scenario)
+        self._require_one_joint_with_an_imu()
+        envs = identified_environments(self)
+        recorded = {
+            **self.model_dump(mode="json", exclude={"output", "on", "arm"}),
+            "scenario": scenario,
+            "hardware": self.on.arguments,
+        }
+        with run_folder("identify", recorded, self.seed, self.output) as folder:
+            try:
+                with _progress(self.on.arguments, console) as progress:
+                    results, points = identify(envs, self.seed, progress)
+            finally:
+                for env in envs:
+                    env.close()
+            results[0].save(folder / "identification.json")
+            models = [env.unwrapped.assumed_model for env in envs]
+            files = [
+                folder / "identification.json",
+                draw_identification(results[0], points[0], models, folder / "identification.png"),
+            ]
+            console.print(result_table(results[0]))
+            if self.repeats > 1:
+                repeats = [{"seed": self.seed + i, **result.model_dump()} for i, result in enumerate(results)]
+                files.append(write_records(repeats, folder / "repeats.csv"))
+                console.print(_spread(results, float(envs[0].unwrapped.truth().model.stiffness[0])))
+        for path in files:
+            console.print(f"wrote {path}", soft_wrap=True)
+        return results
+
+    def _require_one_joint_with_an_imu(self) -> None:
+        """Refuse options that do not go with a real joint."""
+        hardware = self.on.arguments
+        if not hardware:
+            return
+        if hardware.get("imu_port") is None:
+            raise ConfigurationError(
+                "an identification on hardware needs the link's angle: name the IMU with --imu-port"
+            )
+        if self.stiffness is not None or self.repeats > 1:
+            raise ConfigurationError("stiffness and repeats are of a simulated joint; leave them out on hardware")
+        if self.second_mass is not None and not hardware.get("confirm", True):
+            raise ConfigurationError("somebody must change the mass between the runs: a second_mass excludes --yes")
+
+
+@contextmanager
+def _progress(hardware: dict[str, Any], console: Console) -> Iterator[Callable[[float], None]]:
+    """A function that takes the share of the work that is done."""
+    work = "visiting static positions"
+    if hardware:
+        console.print(f"{work} at {hardware['port']}", soft_wrap=True)
+        yield plain_progress(console)
+        return
+    with show_progress(console, {f"{work}, in %": 100}, transient=True) as show:
+        yield lambda share: show(0, round(100 * share))
+
+
+def result_table(result: Identification) -> Table:
+    """An identification as a table."""
+    low = result.stiffness_low_nm_per_rad
+    high = result.stiffness_high_nm_per_rad
+    rows = [
+        ("stiffness K", f"{result.stiffness_nm_per_rad:.1f} N·m/rad"),
+        ("  95 % interval", f"{low:.1f} to {high:.1f} (± {100 * result.half_width:.2f} %)"),
+        ("  plain line", f"{result.line_stiffness_nm_per_rad:.1f} N·m/rad, Pearson r {result.pearson_r:.4f}"),
+        ("friction", f"{result.friction_nm:.2f} N·m ({result.friction_low_nm:.2f} to {result.friction_high_nm:.2f})"),
+        ("dead band", f"{1e3 * result.dead_band_rad:.2f} mrad"),
+        ("offset", f"{1e3 * result.offset_rad:+.2f} mrad"),
+        ("directions differ", "yes (hysteresis)" if result.hysteresis else "no"),
+        ("residual spread", f"{1e3 * result.residual_rad:.3f} mrad"),
+        ("points", f"{result.points} at {result.positions} positions"),
+    ]
+    if result.imu_sine_error_rad is not None:
+        rows.insert(6, ("IMU error ~ sin q", f"{1e3 * result.imu_sine_error_rad:+.2f} mrad"))
+    return make_table("identification", ["", ""], rows, left=2, show_header=False)
+
+
+def identified_environments(options: Identify) -> list[Any]:
+    """The testbed, once per mass; nothing is opened yet."""
+    arguments = dict(options.on.arguments)
+    pendulum = Pendulum(**arguments.pop("pendulum", {}))
+    pendulums = [pendulum]
+    if options.second_mass is not None:
+        pendulums.append(pendulum.with_mass_scaled(options.second_mass))
+    if arguments:
+        name = "elastic_env/HardwareTestbed-v0"
+        arguments["num_envs"] = 1
+    else:
+        name = "elastic_env/Testbed-v0"
+        scenario = options.on.scenario(options.scenario)
+        arguments = {"num_envs": options.repeats, "scenario": scenario, "stiffness": options.stiffness}
+    arguments["reference"] = {"kind": "hold", "positions": options.positions}
+    return [
+        gymnasium.make_vec(name, vectorization_mode="vector_entry_point", pendulum=pendulum, **arguments)
+        for pendulum in pendulums
+    ]
+
+
+def _spread(results: Sequence[Identification], truth: float) -> str:
+    """Spread over the seeds, and how often the intervals hold the truth."""
+    stiffness = np.array([result.stiffness_nm_per_rad for result in results])
+    covered = sum(r.stiffness_low_nm_per_rad <= truth <= r.stiffness_high_nm_per_rad for r in results)
+    widest = max(result.half_width for result in results)
+    return (
+        f"{len(results)} seeds: K median {np.median(stiffness):.1f}, {stiffness.min():.1f} to {stiffness.max():.1f} "
+        f"N·m/rad (true {truth:g}); friction median {np.median([r.friction_nm for r in results]):.2f} N·m; "
+        f"r median {np.median([r.pearson_r for r in results]):.4f}; plain line median "
+        f"{np.median([r.line_stiffness_nm_per_rad for r in results]):.1f}\n"
+        f"the 95 % interval holds the true K in {covered} of {len(results)}, half-width at most {100 * widest:.2f} %"
+    )

@@ -1,0 +1,192 @@
+"""`elastic iterate`: learn offsets on a robot from trial to trial, and write what was learned as a policy."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import model_validator
+from rich.console import Console
+from rich.table import Table
+
+from baselines.adaptation.iterative import IterativeLearner, Stage, Trial
+from baselines.adaptation.learned_signals import LearningGains, learned_signals
+from baselines.adaptation.offset_table import TableDescription, motion_of, save_table
+from baselines.catalogue import learned_base
+from baselines.options import PolicyOptions
+from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
+from elastic_env.core.errors import ConfigurationError
+from elastic_env.runtime.robot_model import WalkerModel
+from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, reference_of
+from train.evaluate.conditions import Condition, PolicySpec
+from train.evaluate.environments import Column
+from train.evaluate.rollout import make_policy, make_vector_env
+from train.figures import plots
+from train.figures.chart import trials_chart
+from train.runs.console import make_table
+from train.runs.escaping import write_records
+from train.runs.folders import provenance, run_folder
+from train.runs.progress import show_progress
+
+_MOST_ROBOTS = 64
+
+
+class Iterate(Model):
+    """Learn on the robot itself, from walk to walk: iterative learning control, without any training in simulation.
+
+    After each trial the offsets of the next one are corrected by what IMU and foot sensors, or on the testbed the IMU
+    of the link, have shown at the same time. Prints a table trial by trial; trial 0 is the base, the last one has all
+    that was learned. Writes the learned offsets as a policy iterative:FOLDER, trials.csv and a picture.
+
+    Example: elastic iterate --scenario soft --trials 10
+
+    Example, one joint: elastic iterate --env testbed --reference sine --scenario soft
+    """
+
+    env: str = "walker"
+    """Environment: walker, testbed, robot, ROBOT.yaml (a file of any robot, see docs/robots.md),
+    or "FILE.py:ROBOT", a JointRobot."""
+    scenario: Title = DEFAULT_SCENARIO
+    """Scenario, see elastic evaluate --help."""
+    reference: MotionOrDefault = None
+    """MotionOrDefault, as in elastic evaluate; it must be the same in every trial."""
+    trials: int = quantity("1", 10, ge=1, le=1000)
+    """Trials that it learns from."""
+    base: Title | None = None
+    """Policy whose offsets are learned; default adaptive_posture, on the testbed input."""
+    seed: int = quantity("1", 0, ge=0, le=LARGEST_SEED - _MOST_ROBOTS)
+    """Seed of the robot, where the scenario draws one."""
+    robots: int = quantity("1", 1, ge=1, le=_MOST_ROBOTS)
+    """Robots, each of which learns by itself; their seeds follow --seed."""
+    output: Path | None = None
+    """Folder for the run, new or empty; default runs/iterate, numbered if taken."""
+
+    @model_validator(mode="after")
+    def _motion_repeats(self) -> "Iterate":
+        condition = self.condition
+        if condition.environment.draws(condition.reference):
+            raise ConfigurationError(
+                f"the reference {condition.reference!r} draws another motion for every seed, and what is "
+                "learned for one is wrong for another; name one that repeats, such as sine or hold"
+            )
+        return self
+
+    @property
+    def gains(self) -> LearningGains:
+        """How it learns."""
+        return LearningGains(trials=self.trials)
+
+    @property
+    def condition(self) -> Condition:
+        """The cell in which it learns."""
+        base = {} if self.base is None else {"learned_base": self.base}
+        return Condition(
+            env=self.env,
+            policy=PolicySpec(name="iterative", options={**base, "learning": self.gains}),
+            reference=reference_of(self.env, self.reference),
+            scenario=self.scenario,
+            seed=self.seed,
+        )
+
+    def run(self, console: Console) -> list[Trial]:
+        """Learn, play a last trial with what was learned, write the run, and print a table of the trials.
+
+        Returns:
+            The trials; the first has no offsets, the last has what was learned.
+
+        Raises:
+            ConfigurationError: A name or a parameter does not exist.
+            ResultsExistError: The output folder holds results.
+        """
+        plots.require_matplotlib()
+        condition = self.condition
+        recorded = self.model_dump(mode="json", exclude={"output"})
+        with closing(make_vector_env(condition, self.robots)) as env:
+            policy: IterativeLearner = make_policy(condition.policy, env)
+            with run_folder("iterate", recorded, self.seed, self.output) as folder:
+                trials = _trials(self, env, policy, console)
+                columns = condition.environment.judged
+                chart = trials_chart(trials, columns, f"Learned on the robot, {self.scenario}")
+                files = [
+                    _write_trials(trials, policy, self.seed, folder / "trials.csv"),
+                    plots.draw_chart(chart, folder / "trials.png"),
+                ]
+                policies = _save(self, env, policy, folder)
+        console.print(trials_table(trials, columns, condition))
+        for path in files:
+            console.print(f"wrote {path}", soft_wrap=True)
+        for path in policies:
+            console.print(f"play it as iterative:{path}", soft_wrap=True)
+        return trials
+
+
+def _trials(options: Iterate, env: Any, policy: IterativeLearner, console: Console) -> list[Trial]:
+    trials: list[Trial] = []
+    with show_progress(console, {"trials": policy.trials + 1}, transient=True) as show:
+
+        def keep(trial: Trial) -> None:
+            trials.append(trial)
+            show(0, len(trials))
+
+        policy.rehearse(env, options.seed, keep)
+        signals = learned_signals(env.unwrapped.assumed_model, options.gains)
+        keep(Stage(env, options.seed).trial(policy, signals, policy.trials))
+    return trials
+
+
+def trials_table(trials: Sequence[Trial], columns: Sequence[Column], condition: Condition) -> Table:
+    """The judged metrics and the failures of every trial, the mean over the robots that did not fail."""
+    title = f"{condition.environment.title(condition.reference_name)}, {condition.scenario}"
+    head = ["trial", *(column.label for column in columns), condition.environment.failures]
+    rows = []
+    for trial in trials:
+        values = [f"{column.scale * trial_mean(trial, column.metric):.{column.decimals}f}" for column in columns]
+        rows.append([str(trial.number), *values, f"{int(trial.failed.sum())} of {len(trial.failed)}"])
+    return make_table(title, head, rows, left=0)
+
+
+def trial_mean(trial: Trial, metric: str) -> float:
+    """A metric of a trial, the mean over the robots that did not fail; nan where all did."""
+    found = [metrics[metric] for metrics, failed in zip(trial.metrics, trial.failed, strict=True) if not failed]
+    return float(np.mean(found)) if found else float("nan")
+
+
+def _write_trials(trials: Sequence[Trial], policy: IterativeLearner, seed: int, path: Path) -> Path:
+    """One row per robot and trial: what the sensors showed, and the metrics."""
+    rows = [
+        {
+            "trial": trial.number,
+            "seed": seed + robot,
+            "failed": bool(trial.failed[robot]),
+            **{
+                f"measured_{name}": rms for name, rms in zip(policy.names, trial.error_rms[robot].tolist(), strict=True)
+            },
+            **metrics,
+        }
+        for trial in trials
+        for robot, metrics in enumerate(trial.metrics)
+    ]
+    return write_records(rows, path)
+
+
+def _save(options: Iterate, env: Any, policy: IterativeLearner, folder: Path) -> list[Path]:
+    """Write the offsets of every robot: to the folder itself for one, else to folders by their seeds."""
+    model = env.unwrapped.assumed_model
+    base = learned_base(PolicyOptions(learned_base=options.base), isinstance(model, WalkerModel))
+    folders = []
+    for robot, table in enumerate(policy.tables):
+        seed = options.seed + robot
+        description = TableDescription(
+            robot=env.unwrapped.task.name,
+            base=base,
+            learning=options.gains,
+            signals=list(policy.names),
+            motion=motion_of(env),
+            control_period_s=model.control_period_s,
+            scenario=options.scenario,
+            training=provenance(seed),
+        )
+        folders.append(folder if len(policy.tables) == 1 else folder / f"robot_{seed}")
+        save_table(folders[-1], description, table)
+    return folders

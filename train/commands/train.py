@@ -1,0 +1,62 @@
+"""`elastic train`: residuals on base policies, for every training seed of configurations."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from elastic_env.core.config import Model, load_yaml
+from elastic_env.core.errors import ConfigurationError
+from train.commands.options import name_options
+from train.learn.run_training import resume, start
+from train.learn.train_config import TrainConfig
+from train.workers.executors import Executors
+
+
+class Train(Model):
+    """Train a residual on top of a base policy, for every training seed of a configuration.
+
+    Example: elastic train configs/train_walker_3s.yaml, and if it was interrupted: elastic train --resume runs/NAME.
+    The seeds of several configurations share the workers: elastic train a.yaml b.yaml --jobs 4.
+    Each configuration has a run of its own. It keeps, for every seed, checkpoint/ to go on from, best/ and last/ as
+    policies, which elastic evaluate and compare take as residual:PATH, progress.csv, and files for TensorBoard.
+    """
+
+    config: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Configurations, one or more; those in configs/train_*.yaml are examples."""
+    resume: tuple[Path, ...] = ()
+    """Folders of runs to go on with."""
+    seeds: list[int] | None = None
+    """Training seeds instead of the configurations' own."""
+    decisions: int | None = None
+    """Decisions of all worlds together instead of the configurations' own."""
+    output: Path | None = None
+    """Folder for the run, new or empty, or for the folders of several; default runs/<name>, numbered if taken."""
+    trust_code: bool = False
+    """With --resume: run the code that the run's algorithm names, where it is none of Stable-Baselines3's."""
+    jobs: int = 1
+    """Seeds at a time, 0 for one per core; several share the cores, and all of them end sooner than one by one."""
+    on: str = "local"
+    """Executors: local, dask://HOST:PORT of a scheduler, slurm, or slurm:FILE.yaml; see docs/cluster.md."""
+
+    def run(self, console: Console) -> None:
+        """Train, or go on with it."""
+        if bool(self.config) == bool(self.resume):
+            raise ConfigurationError("name either configurations or, with --resume, the runs to go on with")
+        given = {"seeds": self.seeds, "decisions": self.decisions}
+        changes = {name: value for name, value in given.items() if value is not None}
+        if self.resume and (changes or self.output is not None):
+            raise ConfigurationError(
+                "a run goes on as it was begun: --resume takes no --seeds, --decisions or --output"
+            )
+        executors = Executors(self.on, self.jobs)
+        if self.resume:
+            folders = resume(self.resume, console, executors, self.trust_code)
+        else:
+            configs = [load_yaml(file, TrainConfig) for file in self.config]
+            with name_options():
+                configs = [config.replace(**changes) for config in configs]
+            folders = start(configs, console, self.output, executors)
+        for folder in folders:
+            console.print(f"policies in {folder}/seed_*/best and last", soft_wrap=True)
