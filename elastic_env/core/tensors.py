@@ -24,9 +24,10 @@ def read_tensors(path: Path) -> tuple[dict[str, npt.NDArray[Any]], bytes]:
     try:
         content = read_bounded(path, _MOST_BYTES, within=path.parent)
         for name, tensor in deserialize(content):
-            if (kind := tensor["dtype"]) not in _FILE_TYPES:
+            kind = shown(tensor["dtype"])[1:-1]
+            if kind not in _FILE_TYPES:
                 raise ConfigurationError(
-                    f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {shown(kind)}"
+                    f"{path}: the tensor {shown(name)} must be of type {' or '.join(_FILE_TYPES)}, got {kind}"
                 )
         return load(content), content
     except (OSError, SafetensorError) as error:

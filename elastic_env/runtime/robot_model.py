@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from elastic_env.core.config import plain_numbers
-from elastic_env.core.errors import ConfigurationError, shown
+from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.files import read_bounded
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
@@ -172,7 +172,7 @@ def read_stiffness(value: "float | str | Path | Sequence[float] | Array") -> "fl
         content = read_bounded(path, LARGEST_JSON)
     except (OSError, ValueError):
         raise ConfigurationError(
-            f"stiffness must be a number [N·m/rad] or an identification file, found no such file {shown(str(path))}"
+            f"stiffness must be a number [N·m/rad] or an identification file, found no file {shortened(path)}"
         ) from None
     try:
         return float(parse_json(content.decode("utf-8"))[STIFFNESS_KEY])
