@@ -66,7 +66,7 @@ class ArmOptions(Model):
     within: float = quantity("1", 0.03, gt=0, lt=1)
     """A joint is told apart where the 95 % interval of 1/K is as narrow as plus or minus this share."""
     assume: float | None = quantity("N·m/rad", None, gt=0)
-    """K [N·m/rad] to write for joints that the poses do not tell; default the largest that was identified."""
+    """K [N·m/rad] to write for joints whose interval reaches to rigid; default each joint's own estimate, or rigid."""
     plan: int = quantity("1", 0, ge=0, le=MOST_PLANNED)
     """Propose so many further poses, within limits and without contacts, that tell the stiffness best."""
 
