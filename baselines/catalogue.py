@@ -28,7 +28,7 @@ from baselines.walking.posture import PostureFeedback
 from baselines.walking.stance_roll import StanceRoll
 from baselines.walking.zmp_offset import ZmpOffset
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 Builder = Callable[[Any, Any, PolicyOptions], Any]
 """Builds a policy for an environment, an assumed model and options."""

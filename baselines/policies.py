@@ -20,7 +20,7 @@ from baselines.compensation.policy import Policy
 from baselines.options import PolicyOptions
 from baselines.residual.residual import RESIDUAL, read_description, residual_policy
 from elastic_env.core.errors import ConfigurationError, shortened, unknown_name
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel, read_stiffness
+from elastic_env.world.robot_model import RobotModel, WalkerModel, read_stiffness
 
 ITERATIVE = "iterative:"
 """Before the folder of what `iterative` has learned, where policies are named."""

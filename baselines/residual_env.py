@@ -22,8 +22,8 @@ from baselines.residual.features import Features, FeaturesMemory
 from baselines.residual.settings import Bound, ResidualSettings
 from elastic_env.core.errors import ActionError, ConfigurationError, shown
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.runtime.envs import final_of, reset_mask
-from elastic_env.runtime.task import Transition
+from elastic_env.world.envs import final_of, reset_mask
+from elastic_env.world.task import Transition
 
 
 class _Deciding:

@@ -15,7 +15,7 @@ from baselines.options import PolicyOptions
 from elastic_env import IDS
 from elastic_env.core.config import Model
 from elastic_env.core.signals import Signal
-from elastic_env.runtime.scenario import scenario_names
+from elastic_env.world.scenario import scenario_names
 from train.commands.cli import COMMANDS, main
 
 HARDWARE = ("scan", "check", "run", "emulate")

@@ -13,8 +13,8 @@ from gymnasium.vector import AutoresetMode
 
 from elastic_env.core.errors import ConfigurationError, require_known, shown
 from elastic_env.rendering.picture import Picture
-from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.runtime.task import Task
+from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.task import Task
 
 _LEAST_WORLD_BYTES = 10_000
 """Memory of a world: measured on the testbed, the smallest robot, without a policy."""

@@ -25,7 +25,7 @@ import baselines
 import elastic_env  # noqa: F401  registers the environments
 from baselines.catalogue import ON_JOINTS, ON_THE_WALKER, Track
 from baselines.policies import sensors_needed
-from elastic_env.runtime.scenario import scenario_names
+from elastic_env.world.scenario import scenario_names
 
 RECORDED = Path(__file__).with_name("fingerprints.json")
 STEPS, WORLDS = 300, 7

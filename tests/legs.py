@@ -3,7 +3,7 @@
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.leg_chains import LegChains, LegLoads
+from elastic_env.rigid.leg_chains import LegChains, LegLoads
 
 
 def foot_frames(chains: LegChains, q: Array) -> tuple[Array, Array]:

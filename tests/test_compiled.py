@@ -24,14 +24,14 @@ from rich.console import Console
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core import compiled as module
 from elastic_env.core.compiled import compile_now, compiled
-from elastic_env.dynamics import control_kernels as kernels
-from elastic_env.runtime import metrics
+from elastic_env.world import control_kernels as kernels
+from elastic_env.world import metrics
 from train.runs.progress import say_what_is_compiled
 
 ROOT = Path(__file__).parents[1]
 KERNELS = (
-    "elastic_env.runtime.metrics", "elastic_env.dynamics.control_kernels",
-    "elastic_env.dynamics.tree.kernels", "elastic_env.dynamics.leg_kernels", "elastic_env.dynamics.tree.end_effector",
+    "elastic_env.world.metrics", "elastic_env.world.control_kernels",
+    "elastic_env.rigid.tree.kernels", "elastic_env.rigid.leg_kernels", "elastic_env.rigid.tree.end_effector",
     "baselines.compensation.compensators", "baselines.compensation.contact_torque", "baselines.walking.controller",
     "baselines.walking.posture", "baselines.walking.zmp_shift", "baselines.estimation.bending",
     "baselines.residual.network",

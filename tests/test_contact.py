@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.contact_force import contact_points, load_share, shares
-from elastic_env.dynamics.ground_contact import FootSensors, zero_moment_point
+from elastic_env.rigid.contact_force import contact_points, load_share, shares
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
 from elastic_env.robots.thormang.standing import settle
+from elastic_env.world.ground_contact import FootSensors, zero_moment_point
 from tests.test_standing import forces_on_the_feet
 
 ROBOT = Thormang()

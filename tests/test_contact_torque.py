@@ -17,15 +17,15 @@ from baselines.compensation.contact_torque import PlannedTorque, WrenchTorque, g
 from baselines.compensation.gravity_torque import GravityModel, make_gravity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.control_kernels import attitude_of
-from elastic_env.dynamics.floating_body import FloatingBody
-from elastic_env.dynamics.leg_kinematics import foot_pose
 from elastic_env.joint.joint_names import JointAddresses
+from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_kinematics import foot_pose
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS
 from elastic_env.robots.thormang.task import WalkTask
-from elastic_env.runtime.robot_model import WalkerModel
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.control_kernels import attitude_of
+from elastic_env.world.robot_model import WalkerModel
+from elastic_env.world.scenario import make_scenario
 from tests.trees import pendulum
 
 WEIGHT_N = 57.0 * 9.81

@@ -10,7 +10,7 @@ import pytest
 from elastic_env import JointRobot
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.end_effector import EndEffector
+from elastic_env.rigid.tree.end_effector import EndEffector
 from tests.three_joints import ARM, rigid_arm
 from tests.trees import ORDER, TREE
 from train.commands.cli import main

@@ -11,8 +11,8 @@ import baselines
 from baselines.residual.mirror import Mirror
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.runtime import further_sensors
-from elastic_env.runtime.further_sensors import SENSORS
+from elastic_env.world import further_sensors
+from elastic_env.world.further_sensors import SENSORS
 from tests.three_joints import ARM
 
 ARM.register()

@@ -18,7 +18,6 @@ import pytest
 from docs.pages.gallery import AtRest, measure
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.joint_names import motor_name
 from elastic_env.joint.known_torque import hinges_of
@@ -26,6 +25,7 @@ from elastic_env.joint.make_elastic import make_elastic, transformed
 from elastic_env.joint.model_file import keep_shapes, urdf_spec
 from elastic_env.joint.time_step import largest_stable_timestep
 from elastic_env.rendering.simple_bodies import add_simple_bodies
+from elastic_env.rigid.tree.torque import TreeTorque
 from elastic_env.robots import gallery
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot, home_pose
 from tests.gallery_files import FOLDER, PACKAGED, excerpt

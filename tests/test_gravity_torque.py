@@ -8,8 +8,8 @@ import pytest
 from baselines.compensation.gravity_torque import GravityModel, HingeTorque, make_gravity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.rigid_body import RigidBody
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.rigid.rigid_body import RigidBody
+from elastic_env.world.robot_model import RobotModel
 from tests.trees import ORDER, TREE, bias_of_mujoco, pendulum, robot, tree
 
 TOLERANCE_NM = 1e-9

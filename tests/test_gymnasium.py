@@ -11,7 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from baselines import ResidualVectorWrapper, ResidualWrapper
-from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 
 SIMULATIONS = {
     "elastic_env/Testbed-v0": {"reference": {"kind": "sine", "duration_s": 0.4, "onset_s": 0.4, "amplitude": 0.1}},

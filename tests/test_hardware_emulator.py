@@ -13,7 +13,7 @@ from elastic_env.hardware.emulator.launch import EmulatorConfig
 from elastic_env.hardware.emulator.servos import EmulatedBus, EmulatedServo, Motor
 from elastic_env.motion.trajectory import quintic
 from elastic_env.robots.testbed.config import TestbedConfig
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 
 
 def make_servo(number: int = 54024, servo_id: int = 1) -> EmulatedServo:

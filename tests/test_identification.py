@@ -17,7 +17,7 @@ from elastic_env.core.signals import Array
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.motion.references import Hold
 from elastic_env.robots.testbed.model import Pendulum
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 from tests.trees import pendulum
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.episodes import Evaluation, evaluate

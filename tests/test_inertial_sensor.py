@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.robots.thormang.environment import make_vector
 from elastic_env.robots.thormang.rows import TRUTH
-from elastic_env.runtime.scenario import make_scenario
-from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
+from elastic_env.world import control_kernels as kernels
+from elastic_env.world.scenario import make_scenario
+from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 from tests.three_joints import ARM
 
 G = 9.81

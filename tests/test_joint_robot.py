@@ -16,7 +16,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from baselines.residual_env import ResidualWrapper
 from elastic_env import JointRobot
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.runtime.scenario import scenario_names
+from elastic_env.world.scenario import scenario_names
 from tests.played import metrics_of
 from tests.three_joints import ARM, rigid_arm
 from train.commands.cli import main

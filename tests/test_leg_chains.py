@@ -10,8 +10,8 @@ import pytest
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.floating_body import FloatingBody
-from elastic_env.dynamics.leg_chains import LegChains, LegLoads
+from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_chains import LegChains, LegLoads
 from elastic_env.robots.thormang.model import LEG_JOINTS, Thormang, biped
 from tests.legs import foot_frames, holding_torque
 

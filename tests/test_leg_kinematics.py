@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from elastic_env.core.errors import ElasticError
-from elastic_env.dynamics.leg_kinematics import LegGeometry, foot_pose, leg_angles, rotation_of_tilt
+from elastic_env.rigid.leg_kinematics import LegGeometry, foot_pose, leg_angles, rotation_of_tilt
 
 LEG = LegGeometry(thigh=0.3, shank=0.28)
 CHAIN = """<mujoco><compiler angle="radian"/><worldbody><body name="hip">

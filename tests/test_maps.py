@@ -13,7 +13,7 @@ from baselines.catalogue import Track
 from docs.pages.learned import learned_maps
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 from tests.cells import METRIC, cell, family
 from train.commands.compare import CompareConfig
 from train.evaluate.changes import changes

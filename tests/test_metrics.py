@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.runtime.metrics import EpisodeMetrics, Metric, RunningStatistic
+from elastic_env.world.metrics import EpisodeMetrics, Metric, RunningStatistic
 
 STATISTICS = {
     "rms": lambda x: np.sqrt(np.mean(x**2)),

@@ -13,7 +13,7 @@ from baselines.residual.mirror import Mirror
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, SignalTable
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 MODEL_SPACE: dict[str, Any] = {"shared": True, "decision_period": 1}
 

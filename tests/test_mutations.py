@@ -17,7 +17,7 @@ from baselines.residual.residual import load_residual, read_description
 from elastic_env.core.config import load_yaml
 from elastic_env.core.errors import ConfigurationError, shown
 from elastic_env.core.json_text import parse_json
-from elastic_env.runtime.physics import substeps
+from elastic_env.world.physics import substeps
 from tests.mutations import RESIDUALS
 from train.commands.bench import BenchConfig
 from train.commands.compare import CompareConfig

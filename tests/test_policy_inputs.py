@@ -26,8 +26,8 @@ from baselines.walking.controller import follow_zmp
 from baselines.walking.zmp_shift import Stances, following_share, move_pelvis
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.leg_kinematics import foot_pose
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.leg_kinematics import foot_pose
+from elastic_env.world.robot_model import WalkerModel
 from tests.test_residual import QUICK, SINE, TESTBED, WALKER, random_network, vector
 
 ROOT = Path(__file__).parents[1]

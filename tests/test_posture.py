@@ -11,7 +11,7 @@ import elastic_env  # noqa: F401  registers the environments
 from baselines.compensation.policy import Zero
 from baselines.walking.posture import PostureFeedback, PostureGains
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.leg_kinematics import foot_pose
+from elastic_env.rigid.leg_kinematics import foot_pose
 from tests.test_walk_policies import PERIOD_S, first, scalar
 
 GAINS = PostureGains(proportional=1.5, integral=2.0, derivative=0.1, leak_s=0.5, limit_rad=0.2)

@@ -14,7 +14,7 @@ from baselines.walking.hip_torque import HipTorque, HipTorqueGains, limit_rate, 
 from baselines.walking.stance_roll import StanceRoll, StanceRollGains, stance_roll
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.leg_kinematics import foot_pose, rotation_x
+from elastic_env.rigid.leg_kinematics import foot_pose, rotation_x
 
 ID = "elastic_env/WalkInPlace-v0"
 SHORT = [0.3, 0.5, 0.3]

@@ -7,7 +7,7 @@ import gymnasium
 import pytest
 
 from elastic_env import IDS
-from elastic_env.runtime.scenario import scenario_names
+from elastic_env.world.scenario import scenario_names
 from train.evaluate import environments
 
 ROOT = Path(__file__).parents[1]

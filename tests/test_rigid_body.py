@@ -6,8 +6,8 @@ import pytest
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.floating_body import FloatingBody
-from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
 
 PENDULUM = Pendulum()

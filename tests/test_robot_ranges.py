@@ -23,8 +23,8 @@ from elastic_env.robots.thormang.environment import configure_walk
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
 from elastic_env.robots.thormang.model import DRAWN_LOAD, add_load, elastic_spec
-from elastic_env.runtime.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
-from elastic_env.runtime.sensors import InertialSensor
+from elastic_env.world.scenario import _BEYOND, TRAINING_RANGES, Scenario, make_scenario
+from elastic_env.world.sensors import InertialSensor
 from tests.three_joints import ARM
 
 SHORT: dict[str, Any] = {"step_period": [0.3, 0.5, 0.3], "num_steps": 1}

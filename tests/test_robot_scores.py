@@ -14,7 +14,7 @@ from scipy import stats
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.robots.thormang.config import robot_bank
-from elastic_env.runtime.scenario import TRAINING_RANGES, make_scenario
+from elastic_env.world.scenario import TRAINING_RANGES, make_scenario
 from tests.cells import METRIC, cell, episode_rows, family, records
 from train.commands.compare import CompareConfig
 from train.evaluate.changes import HELD_OUT, changes

@@ -8,8 +8,8 @@ import pytest
 
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
-from elastic_env.runtime.scenario import Scenario, make_scenario
-from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
+from elastic_env.world.scenario import Scenario, make_scenario
+from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
 
 @pytest.mark.parametrize("scenario", ["ideal", "nominal", "ideal+soft", "ideal+payload+backlash", "ideal+sensor"])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.runtime.sensors import AttitudeSensor, NoiseStream, angle_of_count, attitude, is_due, quantise
+from elastic_env.world.sensors import AttitudeSensor, NoiseStream, angle_of_count, attitude, is_due, quantise
 
 COUNTS = 501_923
 ONE, TWO = np.dtype([("a", np.float64)]), np.dtype([("a", np.float64), ("b", np.float64)])

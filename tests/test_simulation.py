@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from elastic_env.core.signals import Array
-from elastic_env.runtime.physics import ManyWorlds, Simulation, SingleWorld, simulate
+from elastic_env.world.physics import ManyWorlds, Simulation, SingleWorld, simulate
 
 # A cart with an elastic pendulum whose ball bounces on the floor; the servo has an integrator, so there is an `act`.
 ROBOT = """<mujoco>

@@ -15,7 +15,7 @@ from elastic_env.motion.sway import sway_frequencies
 from elastic_env.motion.trajectory import quintic
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.task import WalkTask
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 from tests.trees import pendulum
 
 PERIOD_S = 0.004

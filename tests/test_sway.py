@@ -9,9 +9,9 @@ import pytest
 from scipy import linalg
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.sway import sway_frequencies
+from elastic_env.rigid.biped import Biped
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES, Thormang, biped, elastic_spec
 from elastic_env.robots.thormang.standing import settle
 

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles
-from elastic_env.dynamics.rigid_body import RigidBody
 from elastic_env.joint.make_elastic import make_elastic
+from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles
+from elastic_env.rigid.rigid_body import RigidBody
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS, Thormang, rigid_spec
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.floating_body import pinocchio_model
-from elastic_env.dynamics.rigid_body import RigidBody
-from elastic_env.dynamics.tree import kernels
+from elastic_env.rigid.floating_body import pinocchio_model
+from elastic_env.rigid.rigid_body import RigidBody
+from elastic_env.rigid.tree import kernels
 from tests.test_rigid_body import random_tree, shuffled_names
 
 

@@ -11,8 +11,8 @@ from baselines.compensation.compensators import GravityCompensator, Motion
 from baselines.compensation.gravity_torque import make_gravity
 from elastic_env import ElasticJoint, JointRobot, Servo
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.dynamics.tree.torque import TreeTorque
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.world.robot_model import RobotModel
 from tests.played import metrics_of
 
 # As an arm: a base that turns, a shoulder with a spring, an elbow, and gravity compensation on two of the bodies.

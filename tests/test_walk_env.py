@@ -18,15 +18,15 @@ from scipy.spatial.transform import Rotation
 import elastic_env  # noqa: F401  registers the environments
 from elastic_env.core.errors import ActionError, ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.control_kernels import tilt_penalty, zmp_penalty
 from elastic_env.joint.joint_names import spring_name
 from elastic_env.robots.thormang import config as walk_config
 from elastic_env.robots.thormang import task as walk_in_place
 from elastic_env.robots.thormang.config import BANK_SIZE, WalkConfig, WalkRewardWeights, robot_bank
 from elastic_env.robots.thormang.environment import make as make_walk
 from elastic_env.robots.thormang.environment import make_vector as make_walk_vector
-from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.control_kernels import tilt_penalty, zmp_penalty
+from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.scenario import make_scenario
 from tests.docstrings import documented_tables
 
 ID = "elastic_env/WalkInPlace-v0"

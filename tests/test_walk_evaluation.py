@@ -19,9 +19,9 @@ from baselines.residual_env import ResidualVectorWrapper
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.config import load_yaml
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.leg_kinematics import rotation_x, rotation_y
 from elastic_env.motion.gait import LEFT, RIGHT
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.leg_kinematics import rotation_x, rotation_y
+from elastic_env.world.robot_model import WalkerModel
 from train.commands.cli import main
 from train.commands.compare import CompareConfig, try_out
 from train.evaluate.conditions import Condition, PolicySpec

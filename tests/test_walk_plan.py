@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.contact_force import contact_points, load_share, shares
 from elastic_env.joint.dynamixel import SERVO
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.motion.gait import make_gait
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
 from elastic_env.motion.walk_plan import WalkPlan, derivatives, plan_walk, require_feasible, swing_height, with_torque
+from elastic_env.rigid.biped import Biped
+from elastic_env.rigid.contact_force import contact_points, load_share, shares
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG_JOINTS, SIDES, SOLE_HALF_SIZE_M, Thormang, biped
 from tests.legs import holding_torque
 

@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from baselines.walking.controller import WalkingController, WalkingGains, local_frame
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.floating_body import FloatingBody
-from elastic_env.dynamics.leg_kinematics import LegGeometry, foot_pose
 from elastic_env.motion.gait import make_gait
+from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_kinematics import LegGeometry, foot_pose
 from elastic_env.robots.thormang.config import WalkConfig
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG, LEG_JOINTS
 from elastic_env.robots.thormang.task import WalkTask
-from elastic_env.runtime.robot_model import WalkerModel
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.robot_model import WalkerModel
+from elastic_env.world.scenario import make_scenario
 from tests.legs import holding_torque
 
 PERIOD_S = 0.004

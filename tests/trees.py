@@ -8,7 +8,7 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.robots.testbed.model import JOINT, Pendulum, rigid_spec
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 # A trunk with two hinges whose anchors are off the body's origin; an arm with one more, and a leg of two bodies. Frames
 # are turned, references differ from zero, gravity is tilted, and a body without joints rides along.

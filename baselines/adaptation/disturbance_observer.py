@@ -46,7 +46,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import STAND_S
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 LINK_IMU = "link_imu"
 _LINK_ANGLE = "link_angle_imu"

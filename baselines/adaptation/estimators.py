@@ -26,7 +26,7 @@ from baselines.compensation.policy import ObservationView
 from baselines.estimation.bending import BendingObserver
 from baselines.estimation.joint_stiffness import RegressionMemory, StiffnessPrior, StiffnessRegression
 from elastic_env.core.signals import Array, SignalTable
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 _SEEN = SignalTable(BendingObserver.signals)
 _ERROR = _SEEN.group("model_error")

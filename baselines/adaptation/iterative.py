@@ -17,7 +17,7 @@ from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
 from baselines.compensation.startup import Ramp
 from elastic_env.core.errors import ElasticError
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 _RETREAT = 0.5
 """Share of the offsets that is kept after a trial that failed, such as by a fall."""

@@ -24,7 +24,7 @@ from baselines.walking.zmp_shift import zmp_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 LINK_IMU = "link_angle_imu"
 _LEAST_LOAD = 0.15  # share of the weight below which there is no ZMP

@@ -16,7 +16,7 @@ from baselines.adaptation.estimators import Estimator
 from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs, put_rows, select_rows
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 
 class AdaptationGains(Model):

@@ -20,7 +20,7 @@ from baselines.compensation.policy import (
 from baselines.compensation.startup import Ramp
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.trajectory import STAND_S
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 
 class CompensatedMemory(NamedTuple):

@@ -27,7 +27,7 @@ from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, Parameter
 from elastic_env.joint.elasticity import solve_stiffness, static_deflection, static_link_angle
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 OutputMethod = Literal["taylor", "newton", "wrench", "none"]
 

@@ -5,7 +5,7 @@ contact point is, and what of the robot has mass, is chosen by name:
 
 | name | contact | masses |
 |---|---|---|
-| `com` | at the ZMP, each foot's share at a point of its own (`elastic_env.dynamics.contact_force`) | all links |
+| `com` | at the ZMP, each foot's share at a point of its own (`elastic_env.rigid.contact_force`) | all links |
 | `ankle` | at the ankle axes, so that no ankle carries torque | all links |
 | `lumped` | at the ankle axes | all in the pelvis; the legs weigh nothing, as in published code |
 
@@ -20,10 +20,10 @@ import numpy as np
 from baselines.compensation.policy import WalkView
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.leg_chains import LegChains
-from elastic_env.dynamics.leg_kernels import gradients, loads_type, solutions, torques
 from elastic_env.joint.elasticity import solve_stiffness
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.leg_chains import LegChains
+from elastic_env.rigid.leg_kernels import gradients, loads_type, solutions, torques
+from elastic_env.world.robot_model import WalkerModel
 
 ContactMethod = Literal["com", "ankle", "lumped"]
 

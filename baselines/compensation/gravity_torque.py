@@ -12,9 +12,9 @@ import numpy as np
 from baselines.compensation.contact_torque import ContactGravity, ContactMethod, PlannedTorque, WrenchTorque
 from elastic_env.core.errors import ConfigurationError, require_known
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.rigid_body import RigidBody
-from elastic_env.dynamics.tree.torque import TreeTorque, needs_more_than_gravity
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.rigid.rigid_body import RigidBody
+from elastic_env.rigid.tree.torque import TreeTorque, needs_more_than_gravity
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 GravityMethod = Literal["hinge", "tree", "com", "ankle", "lumped"]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from elastic_env.core.signals import Mirrored, Signal
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 COMMAND = "command"
 DEFLECTION = "deflection"

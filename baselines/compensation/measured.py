@@ -19,7 +19,7 @@ from baselines.compensation.compensators import Compensator, shallow_copy
 from baselines.compensation.policy import Motion
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, SignalTable
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 TORQUE_SENSOR = "joint_torque"
 LINK_ENCODER = "link_encoder"

@@ -22,7 +22,6 @@ from scipy.linalg import get_lapack_funcs
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ActionError, ConfigurationError, ElasticError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.joint_settings import HELD, RIGID, SOFTEST, JointSettings, ServoSettings, key_of, read_joints
 from elastic_env.joint.known_torque import (
     commanded_hinges,
@@ -34,6 +33,7 @@ from elastic_env.joint.load_path import follow_load
 from elastic_env.joint.model_file import GivenModel, compiled_model
 from elastic_env.joint.model_servo import position_servo
 from elastic_env.motion.trajectory import minimum_jerk
+from elastic_env.rigid.tree.torque import TreeTorque
 
 PerJoint = float | Sequence[float] | Mapping[str, Any] | npt.NDArray[Any]
 """A number for all joints, one per joint in order, or by name or pattern, such as {"*": 1000, "wrist_*": 300}."""

@@ -13,7 +13,7 @@ import numpy as np
 from elastic_env.core.signals import Array, BoolArray, IntArray
 from elastic_env.motion.sway import sway_frequencies
 from elastic_env.motion.trajectory import minimum_jerk
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 _SHORTEST_SHARE = 0.2
 

@@ -22,8 +22,8 @@ from baselines.compensation.compensators import GravityCompensator
 from baselines.compensation.policy import Records, WalkView
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array, Signal
-from elastic_env.dynamics.leg_kernels import sole_tilts
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.leg_kernels import sole_tilts
+from elastic_env.world.robot_model import WalkerModel
 
 LOADED_SHARE = 0.15
 """Share of the weight from which an estimate takes a foot for loaded, and flat on the ground."""

@@ -29,8 +29,8 @@ import numpy as np
 
 from baselines.estimation.bending import LOADED_SHARE, BendingObserver
 from elastic_env.core.signals import Array, renamed
-from elastic_env.dynamics.leg_kinematics import rotation_of_tilt
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.leg_kinematics import rotation_of_tilt
+from elastic_env.world.robot_model import WalkerModel
 
 TILT_RAD = 0.01
 VELOCITY_M_PER_S = 0.07

@@ -21,7 +21,7 @@ import numpy as np
 from baselines.compensation.compensators import presliding_friction
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 
 
 class StiffnessPrior(Model):

@@ -24,7 +24,7 @@ from baselines.compensation.policy import (
 from baselines.residual.settings import ResidualSettings
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 
 class CorrectedMemory(NamedTuple):

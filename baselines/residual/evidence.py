@@ -21,7 +21,7 @@ from baselines.compensation.policy import Records
 from baselines.estimation.bending import BendingObserver
 from baselines.residual.correction import Corrected
 from elastic_env.core.signals import Array, SignalTable
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 ERROR_SCALE = 0.1
 LOAD_SCALE = 0.05

@@ -24,8 +24,8 @@ from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal, renamed
-from elastic_env.dynamics.ground_contact import zero_moment_point
-from elastic_env.runtime.robot_model import RobotModel, WalkerModel
+from elastic_env.world.ground_contact import zero_moment_point
+from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OBSERVATION = "observation"
 BASE_ACTION = "base_action"

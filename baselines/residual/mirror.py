@@ -18,7 +18,7 @@ from baselines.compensation.inputs import INPUTS
 from baselines.residual.correction import Corrected
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, Signal
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 _SIGN = {"same": 1.0, "opposite": -1.0, "complement": -1.0}
 _SIDE = re.compile(r"(?<=\.)[lr]_")

@@ -33,10 +33,10 @@ from baselines.walking.zmp_shift import Stances, center_of_mass_per_pelvis, foll
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.leg_kernels import local_frames
 from elastic_env.motion.trajectory import STAND_S, minimum_jerk
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.biped import Biped
+from elastic_env.rigid.leg_kernels import local_frames
+from elastic_env.world.robot_model import WalkerModel
 
 
 class WalkingGains(Model):

@@ -32,11 +32,11 @@ from baselines.compensation.startup import Ramp
 from baselines.walking.zmp_shift import within_reach
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.dynamics.contact_force import shares
-from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt
 from elastic_env.motion.trajectory import STAND_S
 from elastic_env.motion.walk_plan import derivatives
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.contact_force import shares
+from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles, rotation_of_tilt
+from elastic_env.world.robot_model import WalkerModel
 
 
 class FootBalanceGains(Model):

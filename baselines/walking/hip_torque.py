@@ -25,7 +25,7 @@ from baselines.compensation.measured import TORQUE_SENSOR, require_sensor
 from baselines.compensation.policy import Policy, PolicyAround, PolicyInputs
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 _HIP_ROLLS = [1, 7]  # of twelve joints, left and right
 

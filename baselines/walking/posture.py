@@ -26,7 +26,7 @@ from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.trajectory import STAND_S
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 # of six joints of a leg
 _HIP_ROLL = 1

@@ -25,7 +25,7 @@ from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
 from elastic_env.motion.gait import RIGHT
 from elastic_env.motion.trajectory import minimum_jerk
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 _HIP_ROLL = 1  # of six joints of a leg
 

@@ -19,7 +19,7 @@ from typing_extensions import override
 from baselines.compensation.policy import PolicyAround, PolicyInputs
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 _LEAST_LOAD = 0.05
 """Share of the weight below which the feet show no ZMP."""

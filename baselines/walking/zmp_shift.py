@@ -27,8 +27,8 @@ from scipy import linalg
 
 from elastic_env.core.compiled import compiled, record_type
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.dynamics.leg_kinematics import LegGeometry
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.rigid.leg_kinematics import LegGeometry
+from elastic_env.world.robot_model import WalkerModel
 
 _PROBE_M = 0.005
 _REACH = 0.999
@@ -172,7 +172,7 @@ def move_pelvis(legs: Any, stances: Any, steps: IntArray, shift: Array, offset: 
 def level_leg(legs: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Hip roll, hip pitch and knee [rad] of a leg whose sole is parallel to the pelvis, from ankle less hip [m].
 
-    `elastic_env.dynamics.leg_kinematics.leg_angles` has soles of every attitude.
+    `elastic_env.rigid.leg_kinematics.leg_angles` has soles of every attitude.
     """
     distance = math.sqrt(x**2 + y**2 + z**2)
     thigh = legs.thigh

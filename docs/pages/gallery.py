@@ -19,12 +19,12 @@ import numpy as np  # noqa: E402
 
 from baselines import PositionCompensator  # noqa: E402
 from elastic_env.core.signals import Array  # noqa: E402
-from elastic_env.dynamics.tree.torque import TreeTorque  # noqa: E402
 from elastic_env.joint.elasticity import static_link_angle  # noqa: E402
 from elastic_env.joint.known_torque import hinges_of  # noqa: E402
 from elastic_env.rendering.picture import Image  # noqa: E402
 from elastic_env.rendering.sag import SagViews  # noqa: E402
 from elastic_env.rendering.simple_bodies import add_simple_bodies  # noqa: E402
+from elastic_env.rigid.tree.torque import TreeTorque  # noqa: E402
 from elastic_env.robots.gallery import (  # noqa: E402
     GALLERY,
     gallery_joints,

@@ -16,11 +16,11 @@ from baselines.compensation.compensators import newton_link_angle, taylor_link_a
 from baselines.compensation.gravity_torque import make_gravity
 from baselines.identification.identify import Identification, identify
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.floating_body import FloatingBody
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import Hold
+from elastic_env.rigid.floating_body import FloatingBody
 from elastic_env.robots.thormang.model import ANKLE_HEIGHT_M, LEG_JOINTS
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 from train.runs.escaping import write_records
 
 _MODULE = "vector_entry_point"

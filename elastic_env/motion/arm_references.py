@@ -16,10 +16,10 @@ from elastic_env.core.config import LARGEST_SEED, Locator, Model, quantity
 from elastic_env.core.csv_table import read_table
 from elastic_env.core.errors import ConfigurationError, require_known, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.motion.inverse_kinematics import joint_path
 from elastic_env.motion.references import REFERENCES, AboutHome, Hold, Multisine, Sine, Steps, make_reference
 from elastic_env.motion.trajectory import STAND_S, Plan, control_times, quintic
+from elastic_env.rigid.tree.end_effector import EndEffector
 
 _TRIES = 1000
 _LONGEST_S = 7200.0

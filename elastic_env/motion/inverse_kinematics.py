@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.end_effector import EndEffector
+from elastic_env.rigid.tree.end_effector import EndEffector
 
 _POINTS = 100
 """Points of a path per unit of its parameter."""

@@ -10,10 +10,10 @@ import numpy as np
 from scipy import linalg
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.floating_body import FloatingBody
-from elastic_env.dynamics.leg_chains import LegLoads
-from elastic_env.dynamics.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
+from elastic_env.rigid.biped import Biped
+from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_chains import LegLoads
+from elastic_env.rigid.leg_kinematics import leg_angles, rotation_x, rotation_y, rotation_z
 
 _DOF = 6
 _STEP = 1e-4  # of the finite differences [m], [rad]

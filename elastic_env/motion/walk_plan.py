@@ -11,13 +11,13 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError, ElasticError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.contact_force import contact_points, load_share, shares
-from elastic_env.dynamics.floating_body import FloatingBody
-from elastic_env.dynamics.leg_chains import LegLoads
 from elastic_env.joint.elasticity import Servo
 from elastic_env.motion.gait import RIGHT, Gait, Timing, step_timing, support_points, zmp_reference
 from elastic_env.motion.preview_control import PreviewConfig, follow_zmp
+from elastic_env.rigid.biped import Biped
+from elastic_env.rigid.contact_force import contact_points, load_share, shares
+from elastic_env.rigid.floating_body import FloatingBody
+from elastic_env.rigid.leg_chains import LegLoads
 
 _COM_TOLERANCE_M = 1e-10
 _MAX_ITERATIONS = 50

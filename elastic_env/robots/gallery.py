@@ -20,10 +20,10 @@ import numpy as np
 
 from elastic_env.core.errors import missing_extra, require_known
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.known_torque import hinges_of
 from elastic_env.joint.model_file import read_model
+from elastic_env.rigid.tree.torque import TreeTorque
 
 TIMESTEP_S = 1e-3
 """Physics step of all robots, with the integrator `implicitfast` [s]."""

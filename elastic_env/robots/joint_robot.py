@@ -20,8 +20,6 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, BoolArray, Parameter
-from elastic_env.dynamics.tree.end_effector import EndEffector
-from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.joint.make_elastic import transformed
 from elastic_env.motion.arm_references import (
@@ -36,12 +34,14 @@ from elastic_env.motion.references import Multisine
 from elastic_env.registration import Robot, require_models
 from elastic_env.rendering.picture import CAMERA, ModelPicture, set_stage
 from elastic_env.rendering.side_by_side import Alone, Sides
-from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.runtime.joint_config import JointConfig, RewardWeights, require_torque
-from elastic_env.runtime.joint_task import JointPlant, JointTask
-from elastic_env.runtime.robot_model import RobotModel, read_stiffness, with_stiffness
-from elastic_env.runtime.scenario import Scenario, make_scenario
-from elastic_env.runtime.task import ACTION_BOUND_RAD
+from elastic_env.rigid.tree.end_effector import EndEffector
+from elastic_env.rigid.tree.torque import TreeTorque
+from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
+from elastic_env.world.joint_config import JointConfig, RewardWeights, require_torque
+from elastic_env.world.joint_task import JointPlant, JointTask
+from elastic_env.world.robot_model import RobotModel, read_stiffness, with_stiffness
+from elastic_env.world.scenario import Scenario, make_scenario
+from elastic_env.world.task import ACTION_BOUND_RAD
 
 _WIDTH, _HEIGHT = 640, 480
 _ENLARGED = 8.0
@@ -119,10 +119,10 @@ class JointRobot:
         Args:
             reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind`
                 and parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
-            scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+            scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
             stiffness: K of the joints [N·m/rad], one number or one per joint; default that of the joints.
             form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
-            sensors: What is observed beside the standard set, see `elastic_env.runtime.further_sensors`.
+            sensors: What is observed beside the standard set, see `elastic_env.world.further_sensors`.
             reward: Weights of the reward terms, or a mapping of what differs from the default.
             timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
 

@@ -11,7 +11,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from baselines import PositionCompensator
-from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.rigid.rigid_body import RigidBody
 from tests.test_tree import ByPinocchio
 
 JOINTS = [f"joint{i}" for i in range(7)]

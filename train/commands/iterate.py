@@ -17,7 +17,7 @@ from baselines.catalogue import learned_base
 from baselines.options import PolicyOptions
 from elastic_env.core.config import LARGEST_SEED, Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 from train.commands.options import DEFAULT_SCENARIO, MotionOrDefault, reference_of
 from train.evaluate.conditions import Condition, PolicySpec
 from train.evaluate.environments import Column

@@ -27,7 +27,7 @@ from elastic_env.rendering.picture import Image, with_text
 from elastic_env.rendering.sag import ENLARGED, SagViews
 from elastic_env.robots.gallery import GALLERY, gallery_file, gallery_joints, gallery_robot
 from elastic_env.robots.robot.environment import RobotConfig, configure_robot
-from elastic_env.runtime.joint_task import JointPlant
+from elastic_env.world.joint_task import JointPlant
 from train.commands.compare import CompareConfig, compare
 from train.commands.options import Motion, StiffnessOrFile
 from train.commands.play import play

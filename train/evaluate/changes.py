@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from elastic_env.core.signals import Array
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column, Environment
 from train.evaluate.episodes import Evaluation, group_by

@@ -12,7 +12,7 @@ from elastic_env.core.config import LARGEST_SEED, Locator, Model, Title, quantit
 from elastic_env.core.config_problems import meaning_of
 from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.robot_ranges import RobotRanges
-from elastic_env.runtime.scenario import MOST_RANGES, Scenario, make_scenario
+from elastic_env.world.scenario import MOST_RANGES, Scenario, make_scenario
 from train.evaluate.environments import (
     ENVIRONMENTS,
     RESERVED,

@@ -11,7 +11,7 @@ from elastic_env.motion.arm_references import make_arm_reference
 from elastic_env.motion.gait import Gait
 from elastic_env.motion.references import make_reference
 from elastic_env.robots.joint_robot import JointRobot
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 from train.evaluate.robot_file import ENDINGS, read_robot_file
 from train.runs.user_code import named_object
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from baselines.identification.static_points import HoldRecorder, StaticPoints
 from elastic_env.core.signals import Array, BoolArray
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 from train.evaluate.conditions import Condition
 from train.evaluate.rollout import control_steps, make_policy, make_shared_env, policy_errors
 from train.evaluate.support_changes import SupportChanges

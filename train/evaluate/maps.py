@@ -13,7 +13,7 @@ from baselines.catalogue import Track
 from baselines.options import PolicyOptions
 from elastic_env.core.config import MOST_ENTRIES, Model, Title
 from elastic_env.core.errors import ConfigurationError, choices_listed, shown
-from elastic_env.runtime.scenario import GROUNDS
+from elastic_env.world.scenario import GROUNDS
 from train.evaluate.changes import Change, Pairings
 from train.evaluate.conditions import SCENARIO, Condition, scenario_fields, varied
 from train.evaluate.environments import Column, Environment

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 from train.evaluate.changes import opponents
 from train.evaluate.conditions import Condition
 from train.evaluate.environments import Column

@@ -16,7 +16,7 @@ from baselines.catalogue import Track
 from baselines.policies import is_saved, track
 from elastic_env.core.errors import ConfigurationError, ElasticError, SystemFailedError
 from elastic_env.core.signals import BoolArray
-from elastic_env.runtime.scenario import make_scenario
+from elastic_env.world.scenario import make_scenario
 from train.evaluate.conditions import Condition, PolicySpec
 from train.runs.failures import is_full
 from train.runs.user_code import named_object

@@ -18,7 +18,7 @@ import numpy as np
 from baselines.walking.controller import LocalFrame, local_frame
 from elastic_env.core.signals import Array, IntArray
 from elastic_env.motion.gait import Timing
-from elastic_env.runtime.robot_model import WalkerModel
+from elastic_env.world.robot_model import WalkerModel
 
 
 def support_changes(timing: Timing) -> IntArray:

@@ -9,7 +9,7 @@ from baselines.compensation.gravity_torque import make_gravity
 from baselines.identification.identify import Identification
 from baselines.identification.static_points import StaticPoints, link_torque
 from elastic_env.core.signals import Array
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.robot_model import RobotModel
 from train.evaluate.episodes import Evaluation
 from train.figures.colours import policy_colours
 from train.figures.plots import MRAD, require_matplotlib, save

@@ -14,7 +14,7 @@ import numpy as np
 
 from elastic_env.hardware.emulator.faults import Faults, flip_bit
 from elastic_env.hardware.emulator.launch import EmulatorConfig
-from elastic_env.runtime.sensors import attitude
+from elastic_env.world.sensors import attitude
 
 Angles = tuple[float, float, float]
 """Roll, pitch and yaw [rad]."""

@@ -6,7 +6,7 @@ from elastic_env.hardware.emulator.servos import Motor
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import JOINT, elastic_spec
-from elastic_env.runtime.physics import simulate
+from elastic_env.world.physics import simulate
 
 _LARGEST_LAG_S = 0.25
 

@@ -13,7 +13,7 @@ from elastic_env.hardware.live.task import HardwareTestbedTask
 from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.robots.testbed.environment import configure_testbed
 from elastic_env.robots.testbed.picture import TestbedPicture
-from elastic_env.runtime.envs import ElasticEnv, ElasticVectorEnv
+from elastic_env.world.envs import ElasticEnv, ElasticVectorEnv
 
 SCENARIO = "hardware"
 """Name in the place of the scenario in tables of results."""

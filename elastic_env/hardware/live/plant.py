@@ -42,7 +42,7 @@ class CycleTiming:
 
 
 class ServoPlant:
-    """A servo on a bus, an IMU on its link; see `elastic_env.runtime.physics.Simulation`.
+    """A servo on a bus, an IMU on its link; see `elastic_env.world.physics.Simulation`.
 
     Nothing is opened before the first `begin`. A quantity that cannot be measured is nan: the
     link's rate, and without an IMU its angle.

@@ -24,10 +24,10 @@ from elastic_env.hardware.settings import HardwareSettings
 from elastic_env.joint.joint_names import JointAddresses
 from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.task import TestbedTask
-from elastic_env.runtime.joint_task import METRICS_OF_ONE, JointTask, JointTruth
-from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.rows import REAL, WHOLE, Records, record_type
-from elastic_env.runtime.sensors import AttitudeSensor
+from elastic_env.world.joint_task import METRICS_OF_ONE, JointTask, JointTruth
+from elastic_env.world.metrics import Metric
+from elastic_env.world.rows import REAL, WHOLE, Records, record_type
+from elastic_env.world.sensors import AttitudeSensor
 
 TIMING_METRICS = (
     Metric("jitter_rms_s", "jitter", "rms", over="all"),

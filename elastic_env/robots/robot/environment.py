@@ -12,7 +12,6 @@ import mujoco
 
 from elastic_env.core.config import read_mapping
 from elastic_env.core.errors import ConfigurationError, require_known
-from elastic_env.dynamics.tree.end_effector import outermost_body
 from elastic_env.joint.frozen import frozen
 from elastic_env.joint.joint_settings import HELD, GivenJoints, JointSettings, key_of
 from elastic_env.joint.known_torque import (
@@ -26,13 +25,14 @@ from elastic_env.joint.model_file import GivenModel, compiled_spec
 from elastic_env.joint.time_step import stable_timestep
 from elastic_env.motion.arm_references import AnyArmReference
 from elastic_env.registration import Robot
+from elastic_env.rigid.tree.end_effector import outermost_body
 from elastic_env.robots.joint_robot import JointPicture, JointRobot, JointRobotConfig
 from elastic_env.robots.robot import ID, NAME
 from elastic_env.robots.robot.joints import elastic_joints, elastic_settings, home_of_joints
 from elastic_env.robots.robot.model import RigidModel, read_robot
-from elastic_env.runtime.joint_config import RewardWeights
-from elastic_env.runtime.joint_task import JointTask, stiffest
-from elastic_env.runtime.scenario import Scenario
+from elastic_env.world.joint_config import RewardWeights
+from elastic_env.world.joint_task import JointTask, stiffest
+from elastic_env.world.scenario import Scenario
 
 EXAMPLE = Path(__file__).with_name("example.xml")
 """The made-up arm that is played where no model is named; its joints are in the YAML file beside it."""
@@ -72,7 +72,7 @@ def configure_robot(
             All other joints are held where the model's first keyframe has them, or at its reference.
         reference: "poses", "moves", "line", "circle", "sine", "multisine", "steps", "hold", a mapping with `kind` and
             parameters, such as {"kind": "csv", "file": "angles.csv"}, or a reference model.
-        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+        scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
         end_effector: Site or body whose place and tilt are scored; default the outermost body.
         home: Angle about which each joint follows the reference, by name or in order [rad]; default the model's first
             keyframe, or its reference, within the joint ranges.
@@ -81,7 +81,7 @@ def configure_robot(
         imu: Site of the accelerometer.
         stiffness: K in place of that in `joints` [N·m/rad], one number or one per joint.
         form: "tendon" for elastic joints, "rigid" for what an inelastic robot would do.
-        sensors: What is observed beside the standard set, see `elastic_env.runtime.further_sensors`.
+        sensors: What is observed beside the standard set, see `elastic_env.world.further_sensors`.
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms, or where the joints explode
             with it the largest stable one [s].

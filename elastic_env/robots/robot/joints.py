@@ -9,12 +9,12 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.end_effector import outermost_body
-from elastic_env.dynamics.tree.torque import TreeTorque
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.joint.frozen import home_of
 from elastic_env.joint.joint_settings import CURE, GivenJoints, JointSettings, ServoSettings, read_joints
 from elastic_env.joint.model_servo import force_limit, position_servo, rotor_inertia
+from elastic_env.rigid.tree.end_effector import outermost_body
+from elastic_env.rigid.tree.torque import TreeTorque
 
 ROTOR_FREQUENCY_RAD_S = 100.0
 """An assumption for rotors that nobody knows: with the link blocked they swing on their spring at 16 Hz [rad/s]."""

@@ -11,10 +11,10 @@ from elastic_env.joint.elasticity import ElasticJoint, static_link_angle
 from elastic_env.motion.references import AboutHome
 from elastic_env.robots.testbed import NAME
 from elastic_env.robots.testbed.model import JOINT, Pendulum, elastic_spec, imu_arm, rigid_spec
-from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.runtime.joint_config import JointConfig, require_torque
-from elastic_env.runtime.joint_task import JointPlant
-from elastic_env.runtime.robot_model import RobotModel
+from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
+from elastic_env.world.joint_config import JointConfig, require_torque
+from elastic_env.world.joint_task import JointPlant
+from elastic_env.world.robot_model import RobotModel
 
 
 class TestbedConfig(JointConfig):

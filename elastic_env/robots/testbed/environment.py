@@ -13,9 +13,9 @@ from elastic_env.robots.testbed.config import TestbedConfig
 from elastic_env.robots.testbed.model import Pendulum
 from elastic_env.robots.testbed.picture import TestbedPicture
 from elastic_env.robots.testbed.task import TestbedTask
-from elastic_env.runtime.joint_config import RewardWeights
-from elastic_env.runtime.robot_model import read_stiffness
-from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.world.joint_config import RewardWeights
+from elastic_env.world.robot_model import read_stiffness
+from elastic_env.world.scenario import Scenario, make_scenario
 
 
 def configure_testbed(
@@ -34,7 +34,7 @@ def configure_testbed(
 
     Args:
         reference: "hold", "sine", "multisine", "steps", a mapping with `kind` and parameters, or a reference model.
-        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`.
+        scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`.
         stiffness: K of the joint [N·m/rad], or the path of an `identification.json`; default that of the joint.
         joint: Elastic joint, or a mapping of what differs from the paper's H54-200-S500-R, the default.
         pendulum: The load, or a mapping of what differs from the default of 60 N·m at the horizontal.
@@ -43,7 +43,7 @@ def configure_testbed(
         reward: Weights of the reward terms, or a mapping of what differs from the default.
         timestep_s: Physics step, which divides the control period of 4 ms; default 0.5 ms [s].
         sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer", see
-            `elastic_env.runtime.further_sensors`, and "link_imu", which is the same as `observe_link`.
+            `elastic_env.world.further_sensors`, and "link_imu", which is the same as `observe_link`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.

@@ -34,7 +34,7 @@ Action of one world (float32): the command offset a = θ_cmd − q_ref [rad], wi
 """
 
 from elastic_env.robots.testbed.config import TestbedConfig, plant, require_feasible
-from elastic_env.runtime.joint_task import JointTask
+from elastic_env.world.joint_task import JointTask
 
 
 class TestbedTask(JointTask):

@@ -28,8 +28,8 @@ from elastic_env.robots.thormang.model import (
     place_load,
 )
 from elastic_env.robots.thormang.standing import Equilibrium, settle
-from elastic_env.runtime.further_sensors import ACCELEROMETER, add_accelerometer
-from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.world.further_sensors import ACCELEROMETER, add_accelerometer
+from elastic_env.world.scenario import Scenario, make_scenario
 
 FALL_HEIGHT_SHARE = 0.75
 """A pelvis below this share of its planned height has fallen."""
@@ -64,7 +64,7 @@ class WalkConfig(Model):
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """What is observed beside the standard set, see `elastic_env.runtime.further_sensors`."""
+    """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
     timestep_s: float = quantity("s", 1e-3, gt=0, description="physics step")
     reward: WalkRewardWeights = WalkRewardWeights()

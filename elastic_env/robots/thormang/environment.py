@@ -13,8 +13,8 @@ from elastic_env.robots.thormang.config import WalkConfig, WalkRewardWeights
 from elastic_env.robots.thormang.model import Thormang
 from elastic_env.robots.thormang.picture import WalkerPicture
 from elastic_env.robots.thormang.task import WalkTask
-from elastic_env.runtime.robot_model import read_stiffness, with_stiffness
-from elastic_env.runtime.scenario import Scenario, make_scenario
+from elastic_env.world.robot_model import read_stiffness, with_stiffness
+from elastic_env.world.scenario import Scenario, make_scenario
 
 _GAIT = ("lift_m", "hip_height_m", "transfer")
 
@@ -38,7 +38,7 @@ def configure_walk(
     Args:
         step_period: 24, 3, 1.6 or 1.1 [s], the three durations of double, single and double support [s], or a `Gait`.
         num_steps: Number of steps; default 4, or that of the `Gait`.
-        scenario: Name as in `elastic_env.runtime.scenario`, or a `Scenario`; or in a vector environment a list with
+        scenario: Name as in `elastic_env.world.scenario`, or a `Scenario`; or in a vector environment a list with
             one of them for each world.
         stiffness: K of the joints [N·m/rad], one number or twelve, or the path of an `identification.json`; default
             that of the joints.
@@ -50,7 +50,7 @@ def configure_walk(
         bank: Number of the bank that random robots come from, to keep those that are learned from apart.
         timestep_s: Physics step, which divides the control period of 4 ms; default 1 ms [s].
         sensors: What is observed beside the standard set: "link_encoder", "joint_torque", "accelerometer"; see
-            `elastic_env.runtime.further_sensors`.
+            `elastic_env.world.further_sensors`.
 
     Raises:
         ConfigurationError: A name, a parameter or a combination that does not exist.

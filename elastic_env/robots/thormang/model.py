@@ -23,11 +23,11 @@ import numpy as np
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.leg_kinematics import JOINTS, LegGeometry
 from elastic_env.joint.dynamixel import H54_200_S500_R
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.joint.make_elastic import Form, transformed
+from elastic_env.rigid.biped import Biped
+from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry
 
 SIDES = ("l", "r")
 """Prefixes of the left and the right leg."""

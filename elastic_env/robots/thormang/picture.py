@@ -14,13 +14,13 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.biped import Biped
-from elastic_env.dynamics.contact_force import shares
-from elastic_env.dynamics.leg_kinematics import foot_pose, leg_angles
 from elastic_env.motion.gait import LEFT
 from elastic_env.motion.walk_plan import WalkPlan
 from elastic_env.rendering.picture import ModelPicture
 from elastic_env.rendering.side_by_side import Alone, Sides
+from elastic_env.rigid.biped import Biped
+from elastic_env.rigid.contact_force import shares
+from elastic_env.rigid.leg_kinematics import foot_pose, leg_angles
 from elastic_env.robots.thormang.humanoid import (
     GRID_M,
     LEFT_RGBA,

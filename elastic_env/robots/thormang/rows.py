@@ -7,8 +7,8 @@ import numpy as np
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.robots.thormang.tables import GROUPS
-from elastic_env.runtime.robot_model import WalkerModel
-from elastic_env.runtime.rows import COURSE, REAL, WHOLE, record_type
+from elastic_env.world.robot_model import WalkerModel
+from elastic_env.world.rows import COURSE, REAL, WHOLE, record_type
 
 _FEET_WRENCH = (2, 2, 3)  # feet, force and moment, axes
 

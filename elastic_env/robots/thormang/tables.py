@@ -6,8 +6,8 @@ import numpy as np
 
 from elastic_env.core.signals import Mirrored, Signal, SignalGroup, SignalTable
 from elastic_env.robots.thormang.model import LEG_JOINTS, SIDES
-from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.task import joint_groups
+from elastic_env.world.metrics import Metric
+from elastic_env.world.task import joint_groups
 
 JOINTS: Mapping[str, Mirrored] = {
     joint: "opposite" if joint.endswith(("_yaw", "_roll")) else "same" for joint in LEG_JOINTS

@@ -65,8 +65,6 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, IntArray, Signals, SignalTable
-from elastic_env.dynamics import control_kernels as kernels
-from elastic_env.dynamics.ground_contact import FootSensors
 from elastic_env.motion.gait import LEFT, RIGHT
 from elastic_env.motion.trajectory import Plan, PlanTable
 from elastic_env.motion.walk_plan import WalkPlan, plan_walk, require_feasible, with_torque
@@ -95,13 +93,15 @@ from elastic_env.robots.thormang.rows import (
     WalkTruth,
 )
 from elastic_env.robots.thormang.tables import FELL, GROUPS, JOINTS, METRICS, OBSERVATION, PHASES
-from elastic_env.runtime.further_sensors import FurtherSensors
-from elastic_env.runtime.physics import DIVERGED_RAD_S
-from elastic_env.runtime.robot_model import WalkerModel
-from elastic_env.runtime.rows import RULES, Records, Sample, columns_of, one
-from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import InertialSensor, angle_of_count, is_due
-from elastic_env.runtime.task import Task, spring_torque
+from elastic_env.world import control_kernels as kernels
+from elastic_env.world.further_sensors import FurtherSensors
+from elastic_env.world.ground_contact import FootSensors
+from elastic_env.world.physics import DIVERGED_RAD_S
+from elastic_env.world.robot_model import WalkerModel
+from elastic_env.world.rows import RULES, Records, Sample, columns_of, one
+from elastic_env.world.scenario import Scenario
+from elastic_env.world.sensors import InertialSensor, angle_of_count, is_due
+from elastic_env.world.task import Task, spring_torque
 
 UNLOADED_SHARE = 0.05
 """Share of the weight below which a foot, or the sensors of both together, count as unloaded."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import mujoco
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.rigid_body import RigidBody
+from elastic_env.rigid.rigid_body import RigidBody
 
 
 class TreeTorque:

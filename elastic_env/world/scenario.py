@@ -15,7 +15,7 @@ from elastic_env.core.config import Model, Title, quantity
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.robot_ranges import RobotRanges
 from elastic_env.joint.dynamixel import BACKLASH_BOUND_RAD, H54_200_S500_R
-from elastic_env.runtime.sensors import AttitudeSensor, InertialSensor
+from elastic_env.world.sensors import AttitudeSensor, InertialSensor
 
 MOST_RANGES = 100
 """Ranges that the robots of a scenario come from."""

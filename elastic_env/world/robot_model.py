@@ -13,9 +13,9 @@ from elastic_env.core.errors import ConfigurationError, shortened, shown
 from elastic_env.core.files import read_bounded
 from elastic_env.core.json_text import LARGEST_JSON, parse_json
 from elastic_env.core.signals import NO_SIGNALS, Array, Parameter, SignalTable
-from elastic_env.dynamics.biped import Biped
 from elastic_env.joint.elasticity import ElasticJoint, Servo
 from elastic_env.motion.walk_plan import WalkPlan
+from elastic_env.rigid.biped import Biped
 
 STIFFNESS_KEY = "stiffness_nm_per_rad"
 """Where an identification file holds K."""

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.ground_contact import FootSensors, zero_moment_point
-from elastic_env.dynamics.leg_chains import LegChains
-from elastic_env.dynamics.leg_kinematics import JOINTS, LegGeometry, leg_angles
+from elastic_env.rigid.leg_chains import LegChains
+from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry, leg_angles
+from elastic_env.world.ground_contact import FootSensors, zero_moment_point
 
 
 @dataclass(frozen=True, eq=False)

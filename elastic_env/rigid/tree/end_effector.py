@@ -10,8 +10,8 @@ import numpy as np
 from elastic_env.core.compiled import compile_now, compiled
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.kernels import LINK
-from elastic_env.dynamics.tree.links import Tree
+from elastic_env.rigid.tree.kernels import LINK
+from elastic_env.rigid.tree.links import Tree
 
 
 class EndEffector:

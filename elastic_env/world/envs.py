@@ -16,10 +16,10 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError, shown, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signals
 from elastic_env.rendering.picture import Picture
-from elastic_env.runtime.physics import Simulation
-from elastic_env.runtime.robot_model import RobotModel
-from elastic_env.runtime.step_info import StepInfo
-from elastic_env.runtime.task import Task, Transition
+from elastic_env.world.physics import Simulation
+from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.step_info import StepInfo
+from elastic_env.world.task import Task, Transition
 
 Observation: TypeAlias = npt.NDArray[Any]
 Action: TypeAlias = npt.NDArray[Any]

@@ -1,4 +1,4 @@
-r"""Statics of legs, compiled, row by row over a batch; `elastic_env.dynamics.leg_chains` has the formulas.
+r"""Statics of legs, compiled, row by row over a batch; `elastic_env.rigid.leg_chains` has the formulas.
 
 Every joint turns about a coordinate axis, so that taking a vector from link to link mixes two of its components. A row
 is one robot. What is needed of its legs on the way is kept in `Leg`, one leg after the other.
@@ -17,7 +17,7 @@ from elastic_env.core.signals import Array, IntArray
 
 
 def legs_type(legs: int, joints: int) -> np.dtype[Any]:
-    """Row that says what L legs of J joints are, see `elastic_env.dynamics.leg_chains.LegChains`."""
+    """Row that says what L legs of J joints are, see `elastic_env.rigid.leg_chains.LegChains`."""
     return np.dtype(
         (
             np.record,
@@ -34,7 +34,7 @@ def legs_type(legs: int, joints: int) -> np.dtype[Any]:
 
 
 def loads_type(legs: int) -> np.dtype[Any]:
-    """Row that says what loads the legs of a robot, see `elastic_env.dynamics.leg_chains.LegLoads`.
+    """Row that says what loads the legs of a robot, see `elastic_env.rigid.leg_chains.LegLoads`.
 
     Gravity [m/s²] in the pelvis frame, masses [kg] at points of the feet [m], forces and moments on the feet [N],
     [N·m].

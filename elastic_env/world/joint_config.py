@@ -10,7 +10,7 @@ from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
 from elastic_env.joint.elasticity import ElasticJoint
 from elastic_env.motion.references import Hold, Reference
-from elastic_env.runtime.scenario import WALKER_FIELDS, Scenario, make_scenario, scenario_names
+from elastic_env.world.scenario import WALKER_FIELDS, Scenario, make_scenario, scenario_names
 
 
 class RewardWeights(Model):
@@ -29,7 +29,7 @@ class JointConfig(Model):
     form: Literal["tendon", "rigid"] = "tendon"
     """Elastic, or rigid for what an inelastic robot would do."""
     sensors: tuple[Title, ...] = Field(default=(), max_length=16)
-    """What is observed beside the standard set, see `elastic_env.runtime.further_sensors`."""
+    """What is observed beside the standard set, see `elastic_env.world.further_sensors`."""
     control_period_s: float = quantity("s", 0.004, gt=0, description="time between commands")
     timestep_s: float = quantity("s", 5e-4, gt=0, description="physics step")
     reward: RewardWeights = RewardWeights()

@@ -6,7 +6,7 @@
 | `joint_torque` | a joint each | N·m | torque of spring and damper on the link | noise 0.2, offset up to 0.5 |
 | `accelerometer` | x, y, z | m/s² | specific force at the IMU, acceleration minus gravity | noise 0.0112 |
 
-`link_imu` of a fixed robot of one joint is declared in `elastic_env.runtime.joint_task`.
+`link_imu` of a fixed robot of one joint is declared in `elastic_env.world.joint_task`.
 
 The noise of the accelerometer is that of the 3DM-GX4-25, 1.0e-3 m/s²/√Hz (thormang3_imu_3dm_gx4, calib), at half the
 control rate of 250 Hz. That of the torque sensor is an assumption: 0.2 and 0.5 % of 100 N·m. It is drawn anew every
@@ -23,8 +23,8 @@ import numpy as np
 from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import require_known
 from elastic_env.core.signals import Array, BoolArray, Mirrored, SignalGroup, SignalTable
-from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import NoiseStream, angle_of_count, quantise
+from elastic_env.world.scenario import Scenario
+from elastic_env.world.sensors import NoiseStream, angle_of_count, quantise
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
     command → (physics) → truth → measured → score → observation
 
-Kernels do the arithmetic, see `elastic_env.dynamics.control_kernels`. The last control steps stand in blocks of
+Kernels do the arithmetic, see `elastic_env.world.control_kernels`. The last control steps stand in blocks of
 records, from which signals and metrics are made when they are needed.
 """
 
@@ -22,16 +22,16 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ActionError
 from elastic_env.core.robot_ranges import RobotDraw
 from elastic_env.core.signals import Array, BoolArray, Kind, Mirrored, Signal, SignalGroup, Signals, SignalTable
-from elastic_env.dynamics import control_kernels as kernels
 from elastic_env.joint.elasticity import joint_torque
 from elastic_env.motion.trajectory import PlanTable
-from elastic_env.runtime.further_sensors import ACCELEROMETER, FurtherSensors, SensorInputs, specific_force
-from elastic_env.runtime.metrics import EpisodeMetrics, Metric
-from elastic_env.runtime.physics import Simulation, simulate, substeps
-from elastic_env.runtime.robot_model import RobotModel
-from elastic_env.runtime.rows import JOINT, JOINT_COLUMNS, Records, Sample, addresses, columns_of
-from elastic_env.runtime.sensors import NoiseStream
-from elastic_env.runtime.step_info import StepInfo
+from elastic_env.world import control_kernels as kernels
+from elastic_env.world.further_sensors import ACCELEROMETER, FurtherSensors, SensorInputs, specific_force
+from elastic_env.world.metrics import EpisodeMetrics, Metric
+from elastic_env.world.physics import Simulation, simulate, substeps
+from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.rows import JOINT, JOINT_COLUMNS, Records, Sample, addresses, columns_of
+from elastic_env.world.sensors import NoiseStream
+from elastic_env.world.step_info import StepInfo
 
 ACTION_BOUND_RAD = 0.3
 """Largest command offset [rad]."""
@@ -49,7 +49,7 @@ def action_table(joints: Sequence[str]) -> SignalTable:
 
 
 def joint_groups(joints: Mapping[str, Mirrored | None]) -> list[SignalGroup]:
-    """What every robot observes of its joints, `elastic_env.runtime.rows.JOINT_COLUMNS`.
+    """What every robot observes of its joints, `elastic_env.world.rows.JOINT_COLUMNS`.
 
     Args:
         joints: In order, and what an angle of theirs is in the mirror.
@@ -95,7 +95,7 @@ class Task(ABC):
         table: What is observed, further sensors aside.
         sensors: Further sensors, whose columns stand behind the others.
         metrics: Figures of an episode.
-        rules: Records of `elastic_env.runtime.rows.RULES`, one for every kind of world.
+        rules: Records of `elastic_env.world.rows.RULES`, one for every kind of world.
 
     Attributes:
         failure_names: Reasons, beside `DIVERGED`, why an episode can be terminated.

@@ -18,21 +18,21 @@ from elastic_env.core.episode_random import EpisodeRandom
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.robot_ranges import RobotDraw, draw_robot
 from elastic_env.core.signals import Array, BoolArray, Signal, Signals
-from elastic_env.dynamics import control_kernels as kernels
-from elastic_env.dynamics.tree.end_effector import EndEffector
 from elastic_env.joint.joint_names import spring_name
 from elastic_env.joint.time_step import require_stable
 from elastic_env.motion.trajectory import Planned, PlanTable
-from elastic_env.runtime.at_rest import RestWatch
-from elastic_env.runtime.further_sensors import FurtherSensors, SensorInputs
-from elastic_env.runtime.joint_config import JointConfig
-from elastic_env.runtime.metrics import Metric
-from elastic_env.runtime.physics import DIVERGED_RAD_S
-from elastic_env.runtime.robot_model import RobotModel
-from elastic_env.runtime.rows import COURSE, REAL, RULES, WHOLE, Records, Sample, one, record_type
-from elastic_env.runtime.scenario import Scenario
-from elastic_env.runtime.sensors import PendulumImu, angle_of_count, is_due
-from elastic_env.runtime.task import Task, joint_groups, spring_torque
+from elastic_env.rigid.tree.end_effector import EndEffector
+from elastic_env.world import control_kernels as kernels
+from elastic_env.world.at_rest import RestWatch
+from elastic_env.world.further_sensors import FurtherSensors, SensorInputs
+from elastic_env.world.joint_config import JointConfig
+from elastic_env.world.metrics import Metric
+from elastic_env.world.physics import DIVERGED_RAD_S
+from elastic_env.world.robot_model import RobotModel
+from elastic_env.world.rows import COURSE, REAL, RULES, WHOLE, Records, Sample, one, record_type
+from elastic_env.world.scenario import Scenario
+from elastic_env.world.sensors import PendulumImu, angle_of_count, is_due
+from elastic_env.world.task import Task, joint_groups, spring_torque
 
 LINK_IMU = Signal("link_angle_imu", "rad", "IMU on the link", kind="measured")
 LINK_IMU_SENSOR = "link_imu"

@@ -13,7 +13,7 @@ from pydantic import model_validator
 
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array, BoolArray, IntArray
-from elastic_env.dynamics.control_kernels import complementary_filter, in_whole_counts, settled_vertical, shown_angle
+from elastic_env.world.control_kernels import complementary_filter, in_whole_counts, settled_vertical, shown_angle
 
 
 class AttitudeSensor(Model):

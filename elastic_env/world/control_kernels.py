@@ -1,7 +1,7 @@
 """A control step but for the physics, compiled: command, read, measure, score, observe.
 
 One pass over the worlds, between MuJoCo's state and the observation. A world's numbers depend on its own row alone.
-Records have their fields by name, see `elastic_env.runtime.rows`. All robots share the joints. What comes on top stands
+Records have their fields by name, see `elastic_env.world.rows`. All robots share the joints. What comes on top stands
 behind them: links on a fixed base, and a walker.
 
 Numba keeps compiled code by the file of the function that was called. So everything that a kernel calls stands in this
@@ -699,7 +699,7 @@ def in_whole_counts(angle: Any, count_rad: Any) -> Any:
 
 @within_compiled
 def shown_angle(angle: Any, drawn_bias: Any, noise: Any, bias_rad: float, sine_error_rad: float) -> Any:
-    """An angle by the IMU, see `elastic_env.runtime.sensors.attitude` [rad]."""
+    """An angle by the IMU, see `elastic_env.world.sensors.attitude` [rad]."""
     return angle + drawn_bias + noise + (bias_rad + sine_error_rad * np.sin(angle))
 
 

@@ -13,7 +13,7 @@ import pinocchio
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.rigid_body import require_hinge_tree
+from elastic_env.rigid.rigid_body import require_hinge_tree
 
 
 class FloatingBody:

@@ -1,4 +1,4 @@
-"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of `elastic_env.dynamics.tree.kernels`."""
+"""A compiled MuJoCo model as the links of a tree of hinges, for the kernels of `elastic_env.rigid.tree.kernels`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree.kernels import LINK
+from elastic_env.rigid.tree.kernels import LINK
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 from elastic_env.core.compiled import compile_now
 from elastic_env.core.errors import ConfigurationError, ElasticError, require_known
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.tree import kernels
-from elastic_env.dynamics.tree.links import Tree
+from elastic_env.rigid.tree import kernels
+from elastic_env.rigid.tree.links import Tree
 
 
 class RigidBody:

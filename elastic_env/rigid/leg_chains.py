@@ -21,7 +21,7 @@ If joint j turns, all that it carries turns about its anchor. For a joint i befo
 * a wrench (f, n) that is fixed in the foot, as a sensor in the foot measures it, changes by z_j × f and z_j × n_j. For
   i = j and i after j nothing changes.
 
-Legs do not couple: the pelvis' orientation is given by g. `elastic_env.dynamics.leg_kernels` computes all this, row by
+Legs do not couple: the pelvis' orientation is given by g. `elastic_env.rigid.leg_kernels` computes all this, row by
 row.
 """
 
@@ -33,7 +33,7 @@ import numpy as np
 
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, IntArray
-from elastic_env.dynamics import leg_kernels as kernels
+from elastic_env.rigid import leg_kernels as kernels
 
 
 class LegChains:

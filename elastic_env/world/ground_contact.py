@@ -10,7 +10,7 @@ taken about the origin on the ground, the ZMP is
 import numpy as np
 
 from elastic_env.core.signals import Array
-from elastic_env.dynamics.control_kernels import ground_wrenches, moment_points
+from elastic_env.world.control_kernels import ground_wrenches, moment_points
 
 
 class FootSensors:
