@@ -12,6 +12,7 @@ from baselines.compensation.policy import PolicyInputs, Zero
 from baselines.walking.zmp_offset import ZmpOffset, ZmpOffsetGains
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array, SignalTable
+from elastic_env.world.ground_contact import FootSensors
 
 OFFSET_M = np.array([0.011, -0.004])
 STEPS = 500
@@ -44,7 +45,7 @@ def standing(env: Any) -> Array:
     rows = np.array(observation, dtype=np.float64)
     table, biped = env.unwrapped.task.observation_table, env.unwrapped.task.assumed_model.biped
     half, (x, y) = biped.weight / 2.0, OFFSET_M
-    feet = biped.foot_sensors
+    feet = FootSensors.of_biped(biped)
     wrench = np.zeros((2, 2, 2, 3))
     for foot in range(2):
         mass_n = -feet.weight[foot, 2]

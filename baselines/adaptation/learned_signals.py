@@ -24,6 +24,7 @@ from baselines.walking.zmp_shift import zmp_shift_offsets
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.errors import ConfigurationError
 from elastic_env.core.signals import Array
+from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 LINK_IMU = "link_angle_imu"
@@ -83,6 +84,7 @@ class WalkSignals(LearnedSignals):
         self.gains = (gains.attitude, gains.attitude, gains.zmp_x, gains.zmp_y)
         table = model.observation_table
         self._model = model
+        self._sensors = FootSensors.of_biped(model.biped)
         self._attitude = table.group("imu_attitude")
         self._wrench = table.group("wrench")
         self._zmp = table.group("zmp_reference")
@@ -95,7 +97,8 @@ class WalkSignals(LearnedSignals):
     def measured_zmp(self, seen: Array) -> Array:
         """ZMP by the foot sensors, (num_worlds, 2) [m]; nan where the feet carry almost nothing."""
         biped = self._model.biped
-        return biped.zmp_on_footholds(seen[:, self._wrench], _LEAST_LOAD * biped.weight)
+        least_n = _LEAST_LOAD * biped.weight
+        return self._sensors.zmp_of_flat_feet(seen[:, self._wrench], biped.ankles, least_n)
 
     @override
     def offsets(self, table: Array) -> Array:

@@ -24,7 +24,7 @@ from baselines.residual.correction import Corrected
 from baselines.residual.mirror import LeftFirst
 from elastic_env.core.errors import ConfigurationError, unknown_name
 from elastic_env.core.signals import Array, BoolArray, Signal, renamed
-from elastic_env.world.ground_contact import zero_moment_point
+from elastic_env.world.ground_contact import FootSensors, zero_moment_point
 from elastic_env.world.robot_model import RobotModel, WalkerModel
 
 OBSERVATION = "observation"
@@ -205,7 +205,7 @@ class _ContactError:
         self._level = GroundLevel(model, period_s)
         self._share = table.group("load_share")
         self._zmp = table.group("zmp_reference")
-        self._sensors = biped.foot_sensors
+        self._sensors = FootSensors.of_biped(biped)
         self._ankles = biped.ankles
 
     def begin(self, num_worlds: int) -> GroundMemory:

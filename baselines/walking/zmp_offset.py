@@ -19,6 +19,7 @@ from typing_extensions import override
 from baselines.compensation.policy import PolicyAround, PolicyInputs
 from elastic_env.core.config import Model, quantity
 from elastic_env.core.signals import Array
+from elastic_env.world.ground_contact import FootSensors
 from elastic_env.world.robot_model import WalkerModel
 
 _LEAST_LOAD = 0.05
@@ -52,7 +53,8 @@ class ZmpOffset(PolicyAround):
         table = model.observation_table
         super().__init__(policy, table, model.control_period_s)
         gains = gains or ZmpOffsetGains()
-        self._biped = model.biped
+        self._ankles = model.biped.ankles
+        self._sensors = FootSensors.of_biped(model.biped)
         self._wrench = table.group("wrench")
         self._zmp = table.group("zmp_reference")
         self._least_n = _LEAST_LOAD * model.biped.weight
@@ -66,7 +68,7 @@ class ZmpOffset(PolicyAround):
     @override
     def act(self, rows: Array, memory: ZmpOffsetMemory, inputs: PolicyInputs) -> tuple[Array, ZmpOffsetMemory]:
         """Its shift adds to the input `zmp`."""
-        measured = self._biped.zmp_on_footholds(rows[:, self._wrench], self._least_n)
+        measured = self._sensors.zmp_of_flat_feet(rows[:, self._wrench], self._ankles, self._least_n)
         error = np.nan_to_num(measured - rows[:, self._zmp], nan=0.0)
         shift = np.clip(memory.shift - self._rate * error, -self._limit, self._limit)
         zmp = shift if inputs.zmp is None else inputs.zmp + shift

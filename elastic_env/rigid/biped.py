@@ -9,7 +9,6 @@ import numpy as np
 from elastic_env.core.signals import Array
 from elastic_env.rigid.leg_chains import LegChains
 from elastic_env.rigid.leg_kinematics import JOINTS, LegGeometry, leg_angles
-from elastic_env.world.ground_contact import FootSensors, zero_moment_point
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +42,9 @@ class Biped:
         return LegChains(self.rigid, self._legs, feet_weigh=False)
 
     @cached_property
-    def foot_sensors(self) -> FootSensors:
-        """The force-torque sensors at its ankles."""
-        feet = [int(self.rigid.joint(leg[-1]).bodyid[0]) for leg in self._legs]
-        return FootSensors(self.rigid.body_mass[feet], self.rigid.body_ipos[feet], self.rigid.opt.gravity)
+    def feet(self) -> list[int]:
+        """Bodies of the feet in the rigid model, left first."""
+        return [int(self.rigid.joint(leg[-1]).bodyid[0]) for leg in self._legs]
 
     @property
     def _legs(self) -> list[tuple[str, ...]]:
@@ -77,18 +75,6 @@ class Biped:
     def ankles(self) -> Array:
         """Where the ankles are with the feet flat on their footholds, left first, (2, 3) [m]."""
         return np.pad(self.footholds, ((0, 0), (0, 1)), constant_values=self.ankle_height)
-
-    def zmp_on_footholds(self, wrench: Array, least_n: float) -> Array:
-        """ZMP by the sensors at the ankles, as if the feet lay flat on their footholds, (n, 2) [m].
-
-        Args:
-            wrench: Force and moment at each ankle in the frame of the foot, (n, 12) or (n, 2, 2, 3) [N], [N·m].
-            least_n: Vertical force below which there is no ZMP, and the result is nan [N].
-        """
-        n = len(wrench)
-        flat = np.broadcast_to(np.eye(3), (n, 2, 3, 3))
-        force, moment = self.foot_sensors.ground_wrench(wrench.reshape(n, 2, 2, 3), flat)
-        return zero_moment_point(force, moment, self.ankles, least_n)
 
     def joint_angles(self, pelvis: Array, ankles: Array) -> Array:
         """Inverse kinematics with level pelvis and soles.

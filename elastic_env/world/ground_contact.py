@@ -10,6 +10,7 @@ taken about the origin on the ground, the ZMP is
 import numpy as np
 
 from elastic_env.core.signals import Array
+from elastic_env.rigid.biped import Biped
 from elastic_env.world.control_kernels import ground_wrenches, moment_points
 
 
@@ -30,6 +31,12 @@ class FootSensors:
         self.com = foot_com
         self.weight = foot_mass[:, None] * gravity
 
+    @classmethod
+    def of_biped(cls, biped: Biped) -> "FootSensors":
+        """The force-torque sensors at the ankles of a biped."""
+        model = biped.rigid
+        return cls(model.body_mass[biped.feet], model.body_ipos[biped.feet], model.opt.gravity)
+
     def ground_wrench(self, sensors: Array, foot_R: Array) -> tuple[Array, Array]:
         """Force and moment of the ground on each foot, about its ankle, in the world.
 
@@ -45,6 +52,19 @@ class FootSensors:
         ground_wrenches(seen, R, self.com, self.weight, force, moment)
         shape = foot_R.shape[:-1]
         return force.reshape(shape), moment.reshape(shape)
+
+    def zmp_of_flat_feet(self, wrench: Array, ankles: Array, least_n: float) -> Array:
+        """ZMP as if the feet lay flat where they are planned, (n, 2) [m].
+
+        Args:
+            wrench: Force and moment at each ankle in the frame of the foot, (n, 12) or (n, 2, 2, 3) [N], [N·m].
+            ankles: Planned positions of the ankles, (2, 3) [m].
+            least_n: Vertical force below which there is no ZMP, and the result is nan [N].
+        """
+        n = len(wrench)
+        flat = np.broadcast_to(np.eye(3), (n, 2, 3, 3))
+        force, moment = self.ground_wrench(wrench.reshape(n, 2, 2, 3), flat)
+        return zero_moment_point(force, moment, ankles, least_n)
 
 
 def zero_moment_point(force: Array, moment: Array, ankle: Array, least_n: float) -> Array:
